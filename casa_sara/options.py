@@ -1,0 +1,75 @@
+"""What the user asked for, as frozen dataclasses named after the task parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+__all__ = ["Selection", "ImageGrid", "Weighting", "SolverOptions"]
+
+SARA_BASES = ("dirac", "db1", "db2", "db3", "db4", "db5", "db6", "db7", "db8")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Data selection with tclean's words (CASA MSSelection syntax).
+
+    Every selection parameter is one string for all MeasurementSets, or a
+    tuple with one string for each of them.
+    """
+
+    vis: tuple[str, ...]
+    field: str | tuple[str, ...] = ""
+    spw: str | tuple[str, ...] = ""
+    timerange: str | tuple[str, ...] = ""
+    uvrange: str | tuple[str, ...] = ""
+    antenna: str | tuple[str, ...] = ""
+    scan: str | tuple[str, ...] = ""
+    observation: str | tuple[str, ...] = ""
+    intent: str | tuple[str, ...] = ""
+    datacolumn: str = "corrected"
+
+    PARAMETERS = ("field", "spw", "timerange", "uvrange", "antenna", "scan", "observation", "intent")
+
+    def of(self, ms: int) -> dict[str, str]:
+        """Return the non-empty selection strings of MeasurementSet number `ms`."""
+        chosen = {}
+        for name in self.PARAMETERS:
+            value = getattr(self, name)
+            value = value if isinstance(value, str) else value[ms]
+            if value:
+                chosen[name] = value
+        return chosen
+
+
+@dataclass(frozen=True)
+class ImageGrid:
+    """The image plane: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive."""
+
+    shape: tuple[int, int]
+    cell_rad: tuple[float, float]
+    phasecenter: str = ""
+    projection: str = "SIN"
+    stokes: str = "I"
+    reffreq: str = ""
+
+
+@dataclass(frozen=True)
+class Weighting:
+    """Imaging weights of .psf, .residual and .image; they never touch the model."""
+
+    weighting: str = "natural"
+    robust: float = 0.5
+    npixels: int = 0
+    uvtaper: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """Everything the solver may be told; the defaults are those of the task."""
+
+    niter: int = 100_000
+    wavelets: tuple[str, ...] = field(default=SARA_BASES)
+    wavelevels: int = 4
+    positivity: bool = True
+    precondition: bool = True
+    nthreads: int = 0
