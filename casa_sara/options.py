@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 __all__ = ["Selection", "ImageGrid", "Weighting", "SolverOptions"]
 
@@ -65,11 +65,23 @@ class Weighting:
 
 @dataclass(frozen=True)
 class SolverOptions:
-    """Everything the solver may be told; the defaults are those of the task."""
+    """Everything the solver may be told, named after the task parameters, which describe them."""
 
     niter: int = 100_000
-    wavelets: tuple[str, ...] = field(default=SARA_BASES)
+    wavelets: tuple[str, ...] = SARA_BASES
     wavelevels: int = 4
     positivity: bool = True
     precondition: bool = True
-    nthreads: int = 0
+    databound: str = "adapt"
+    boundtol: float = 1e-2
+    boundrelchange: float = 1e-2
+    boundstep: float = 0.618
+    boundinterval: int = 20
+    l2bound: tuple[float, ...] = ()
+    nreweights: int = 20
+    reweightdecay: float = 0.618
+    reweighttol: float = 1e-2
+    reltol: float = 2e-4
+    finalreltol: float = 1e-4
+    regscale: float = 1.0
+    nthreads: int = 1

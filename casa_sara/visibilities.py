@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-__all__ = ["RowTable", "Visibilities"]
+__all__ = ["BlockInfo", "RowTable", "Visibilities", "snapshot_blocks", "sort_into_blocks"]
+
+SNAPSHOT_SECONDS = 1800.0
+SNAPSHOT_SAMPLES = 100_000
+SMALLEST_SNAPSHOT = 500
+SESSION_GAP_SECONDS = 12 * 3600.0
 
 
 @dataclass
 class RowTable:
     """What is known of each MeasurementSet row that holds at least one sample, all (R,).
 
-    `row` counts in its own MeasurementSet, `ms` numbers the MeasurementSets,
-    `time` is the centroid in MJD seconds and `interval` its length in seconds.
+    `row` counts in its own MeasurementSet, `ms` numbers the MeasurementSets (in `vis`'s
+    order), `time` is the middle of the integration in MJD seconds (UTC) and `interval`
+    its length in seconds.
     """
 
     ms: np.ndarray
@@ -54,6 +60,15 @@ class Visibilities:
         Reason → number of samples that were left out.
     notes : list of str
         Warnings that the user must see, also in the record of the run.
+    phase_center : dict
+        Direction of the image centre, a CASA direction measure.
+    freq_range_hz : (float, float)
+        Lowest and highest LSRK frequency of the selection, edges of the channels.
+    spws : dict
+        Number of the MeasurementSet → the spectral windows selected of it; a
+        MeasurementSet of which nothing is selected is missing here.
+    observatory : str
+        Name of the telescope, of the first row selected.
     """
 
     vis: np.ndarray
@@ -66,8 +81,212 @@ class Visibilities:
     ms_names: tuple[str, ...] = ()
     dropped: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    phase_center: dict = field(default_factory=dict)
+    freq_range_hz: tuple[float, float] = (0.0, 0.0)
+    spws: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    observatory: str = ""
 
     @property
     def size(self) -> int:
         """Number of samples M."""
         return self.vis.size
+
+    @property
+    def max_uv(self) -> float:
+        """Longest projected baseline in wavelengths."""
+        return float(np.sqrt(np.max(self.uvw[0] ** 2 + self.uvw[1] ** 2)))
+
+    @property
+    def max_w(self) -> float:
+        """Largest |w| in wavelengths."""
+        return float(np.max(np.abs(self.uvw[2])))
+
+
+@dataclass(frozen=True)
+class BlockInfo:
+    """What a snapshot block holds; `start` and `end` in MJD seconds."""
+
+    ms_name: str
+    observations: tuple[int, ...]
+    scans: tuple[int, ...]
+    start: float
+    end: float
+    samples: int
+
+    @property
+    def label(self) -> str:
+        """The block in one line."""
+        first, last = (_clock(time) for time in (self.start, self.end))
+        observations, scans = (",".join(map(str, numbers)) for numbers in (self.observations, self.scans))
+        return f"{self.ms_name} observation {observations} scan {scans}, {first} to {last}, {self.samples} samples"
+
+
+def _clock(mjd_seconds):
+    """Spell a time in UTC."""
+    return str(np.datetime64("1858-11-17T00:00:00") + np.timedelta64(round(mjd_seconds), "s"))
+
+
+def snapshot_blocks(visibilities, blocks=0):
+    """Split the samples into snapshots: spans over which errors may be taken as constant.
+
+    Each block gets an ℓ2 bound of its own. The automatic rule (`blocks` = 0):
+
+    1. one block for each scan of each observation of each MeasurementSet (and for each
+       session of it: a gap of 12 h starts a new one);
+    2. a scan longer than 30 min, or of more than 1e5 samples, is cut into equal spans of
+       time, as many as bring it below both limits; an integration is never cut;
+    3. a block of fewer than 500 samples is joined to the neighbour nearer in time, the
+       smallest first, as long as the session has one: a bound from few samples says little.
+
+    With `blocks` = n there are n blocks of equal size (± 1) along time; they do not cross from
+    one MeasurementSet to another, unless these outnumber the blocks.
+
+    Parameters
+    ----------
+    visibilities : Visibilities
+    blocks : int
+        0 for the automatic rule, or the number of blocks.
+
+    Returns
+    -------
+    block_of_sample : int32 (M,)
+        Numbers 0 … d−1 along MeasurementSets and time; every block holds a sample.
+    infos : list of d BlockInfo
+
+    Raises
+    ------
+    ValueError
+        When `blocks` is negative or exceeds the number of samples.
+    """
+    if not 0 <= blocks <= visibilities.size:
+        raise ValueError(f"blocks = {blocks}: it takes 0 (automatic) or 1 to {visibilities.size}, the number of visibilities")
+    if blocks:
+        block_of_sample = _equal_blocks(visibilities, blocks)
+    else:
+        block_of_sample = _blocks_of_rows(visibilities)[visibilities.row]
+    return block_of_sample, _block_infos(visibilities, block_of_sample)
+
+
+def _equal_blocks(visibilities, blocks):
+    """Return the block of every sample for a given number of blocks of equal size."""
+    rows = visibilities.rows
+    order = np.lexsort((rows.time[visibilities.row], rows.ms[visibilities.row]))
+    sizes = np.bincount(rows.ms[visibilities.row])
+    sizes = sizes[sizes > 0]
+    if blocks < sizes.size:
+        sizes, shares = np.array([visibilities.size]), np.array([blocks])
+    else:
+        shares = np.ones(sizes.size, dtype=int)
+        for _ in range(blocks - sizes.size):
+            shares[np.argmax(sizes / shares)] += 1
+    along = [np.arange(size) * share // size for size, share in zip(sizes, shares)]
+    starts = np.concatenate([[0], np.cumsum(shares)[:-1]])
+    block_of_sample = np.empty(visibilities.size, dtype=np.int32)
+    block_of_sample[order] = np.concatenate([start + part for start, part in zip(starts, along)])
+    return block_of_sample
+
+
+def _blocks_of_rows(visibilities):
+    """Return the block int32 (R,) of every row by the automatic rule."""
+    rows = visibilities.rows
+    samples = np.bincount(visibilities.row, minlength=rows.time.size)
+    order = np.lexsort((rows.time, rows.observation, rows.ms))
+    steps = [np.diff(column[order]) != 0 for column in (rows.ms, rows.observation)]
+    steps.append(np.diff(rows.time[order]) > SESSION_GAP_SECONDS)
+    session = np.empty(order.size, dtype=np.int64)
+    session[order] = np.concatenate([[0], np.cumsum(np.any(steps, axis=0))])
+    scan = _numbered(session, rows.scan.astype(np.int64))
+    piece = _numbered(scan, _time_spans(scan, rows.time, samples))
+    return _join_small(piece, session, rows.time, samples)
+
+
+def _numbered(major, minor):
+    """Number the distinct pairs of integers, sorted, and return the number of each element."""
+    return np.unique(major * (minor.max() + 1) + minor, return_inverse=True)[1]
+
+
+def _time_spans(scan, time, samples):
+    """Number the equal spans of time within each scan that bring it below the limits."""
+    count = scan.max() + 1
+    start, end = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(start, scan, time)
+    np.maximum.at(end, scan, time)
+    length = end - start
+    total = np.bincount(scan, weights=samples)
+    spans = np.ceil(np.maximum(np.maximum(length / SNAPSHOT_SECONDS, total / SNAPSHOT_SAMPLES), 1)).astype(int)
+    along = (time - start[scan]) / np.where(length > 0, length, 1)[scan]
+    return np.minimum(np.floor(along * spans[scan]).astype(int), spans[scan] - 1)
+
+
+def _join_small(piece, session, time, samples):
+    """Join pieces that are too small to their neighbours; return the block of every row, along time."""
+    count = piece.max() + 1
+    start, end = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(start, piece, time)
+    np.maximum.at(end, piece, time)
+    size = np.bincount(piece, weights=samples)
+    home = np.zeros(count, dtype=np.int64)
+    home[piece] = session
+    number = np.empty(count, dtype=np.int32)
+    blocks = 0
+    for current in np.unique(home):
+        here = np.flatnonzero(home == current)
+        spans = [[start[k], end[k], size[k], [k]] for k in here[np.argsort(start[here], kind="stable")]]
+        while len(spans) > 1:
+            k = min(range(len(spans)), key=lambda j: spans[j][2])
+            if spans[k][2] >= SMALLEST_SNAPSHOT:
+                break
+            before = spans[k][0] - spans[k - 1][1] if k > 0 else np.inf
+            after = spans[k + 1][0] - spans[k][1] if k + 1 < len(spans) else np.inf
+            left = k - 1 if before <= after else k
+            one, two = spans[left : left + 2]
+            spans[left : left + 2] = [[one[0], max(one[1], two[1]), one[2] + two[2], one[3] + two[3]]]
+        for span in spans:
+            number[span[3]] = blocks
+            blocks += 1
+    return number[piece]
+
+
+def _block_infos(visibilities, block_of_sample):
+    """Describe every block."""
+    rows = visibilities.rows
+    samples = np.bincount(block_of_sample)
+    pairs = np.unique(block_of_sample.astype(np.int64) * rows.time.size + visibilities.row)
+    first = np.searchsorted(pairs, np.arange(samples.size + 1) * rows.time.size)
+    infos = []
+    for number, (begin, end) in enumerate(zip(first[:-1], first[1:])):
+        here = pairs[begin:end] - number * rows.time.size
+        infos.append(
+            BlockInfo(
+                ms_name=", ".join(visibilities.ms_names[k] for k in np.unique(rows.ms[here])),
+                observations=tuple(np.unique(rows.observation[here]).tolist()),
+                scans=tuple(np.unique(rows.scan[here]).tolist()),
+                start=float(np.min(rows.time[here] - rows.interval[here] / 2)),
+                end=float(np.max(rows.time[here] + rows.interval[here] / 2)),
+                samples=int(samples[number]),
+            )
+        )
+    return infos
+
+
+def sort_into_blocks(visibilities, block_of_sample):
+    """Return the same samples ordered so that each block is one slice.
+
+    Parameters
+    ----------
+    visibilities : Visibilities
+    block_of_sample : int (M,)
+        Numbers 0 … d−1.
+
+    Returns
+    -------
+    sorted : Visibilities
+        Within a block the order is that of `visibilities`.
+    offsets : int64 (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    """
+    order = np.argsort(block_of_sample, kind="stable")
+    per_sample = ("vis", "weight", "imaging_weight", "uvw", "row", "chan")
+    columns = {name: np.take(getattr(visibilities, name), order, axis=-1) for name in per_sample}
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(block_of_sample))]).astype(np.int64)
+    return replace(visibilities, **columns), offsets

@@ -1,0 +1,1 @@
+"""All that talks to CASA's tools: data in, weights, images and model column out."""

@@ -1,0 +1,52 @@
+# make test, make demo: everything they need is set up on the first call, in $(VENV), offline from then on.
+#   make PYTHON=python3.12 VENV=.venv312 test    another Python, another environment
+
+PYTHON ?= python3
+VENV ?= .venv
+python := $(abspath $(VENV))/bin/python
+
+.PHONY: test demo install tasks clean
+
+test: install
+	$(python) -m pytest
+
+demo: install
+	$(python) -m casa_sara.demo
+
+install: $(VENV)/installed
+
+# The tasks, from xml/*.xml.
+tasks:
+	$(PYTHON) tools/xml2task.py
+
+clean:
+	rm -rf $(VENV) build casa_sara.egg-info
+
+# CASA's data and logs, for every Python of this environment that is not told otherwise: the data of
+# the package casadata, no download, no log file, nothing written to ~/.casa. A user's own
+# ~/.casa/config.py is read after it and wins.
+define CASA_SITE
+import os as _os
+import sys as _sys
+
+import casadata as _casadata
+
+measurespath = _casadata.datapath
+datapath = [_casadata.datapath]
+measures_auto_update = data_auto_update = False
+cachedir = _os.path.join(_sys.prefix, "casa")
+logfile = _os.devnull
+nogui = nologger = agg = True
+endef
+export CASA_SITE
+CASA_PTH := import os, sys; os.environ.setdefault("CASASITECONFIG", os.path.join(sys.prefix, "casasiteconfig.py"))
+
+$(VENV)/installed: setup.cfg pyproject.toml Makefile
+	@$(PYTHON) -c 'import sys; (3, 10) <= sys.version_info < (3, 14) or sys.exit( \
+	    "CASA has no wheels for Python %d.%d: make PYTHON=python3.11, or any from 3.10 to 3.13" % sys.version_info[:2])'
+	$(PYTHON) -m venv $(VENV)
+	echo '*' > $(VENV)/.gitignore
+	$(python) -m pip install --quiet --disable-pip-version-check --editable '.[shell,test]'
+	echo "$$CASA_SITE" > $(VENV)/casasiteconfig.py
+	echo '$(CASA_PTH)' > "$$($(python) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/casa_sara_casasite.pth"
+	touch $@

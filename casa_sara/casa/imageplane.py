@@ -1,0 +1,168 @@
+"""The image plane as tclean lays it out: coordinates, primary beam, and what an image says of its origin.
+
+CASA's own synthesisimager makes them from the selected data, so they are tclean's by construction.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.casa.quantities import check_frequency
+from casa_sara.casa.tools import opened
+
+__all__ = ["ImagePlane", "define_image_plane", "read_pixels", "slabs"]
+
+PB_LIMIT = 0.2  # of tclean: below it, .pb is zero and .pb, .residual and .image are masked
+_SELECTDATA_KEYS = {"timerange": "timestr", "uvrange": "uvdist", "observation": "obs", "intent": "state"}
+_SLAB = 4_000_000  # pixels read or written at a time
+
+
+@dataclass(frozen=True)
+class ImagePlane:
+    """What all images of one run have in common.
+
+    Attributes
+    ----------
+    csys : dict
+        Record of the coordinate system: right ascension, declination, Stokes, frequency.
+    pb : float32 (nx, ny)
+        Primary beam, 1 at its peak, 0 below `PB_LIMIT`.
+    mask : bool (nx, ny)
+        Good pixels, where the primary beam is above `PB_LIMIT`.
+    imageinfo : dict
+        Name of the source and type of the image.
+    miscinfo : dict
+        Telescope and distance.
+    """
+
+    csys: dict
+    pb: np.ndarray
+    mask: np.ndarray
+    imageinfo: dict
+    miscinfo: dict
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Pixels in right ascension and declination."""
+        return self.pb.shape
+
+
+def define_image_plane(visibilities, selection, grid):
+    """Return the image plane that tclean makes of this selection and grid.
+
+    As in tclean, the MeasurementSet that begins first gives the date, the observer and the
+    source's name. Nothing is written to the MeasurementSets, and no files are left behind.
+
+    Parameters
+    ----------
+    visibilities : casa_sara.visibilities.Visibilities
+        What was read, for its phase centre and the MeasurementSets that it comes from.
+    selection : casa_sara.options.Selection
+    grid : casa_sara.options.ImageGrid
+
+    Returns
+    -------
+    ImagePlane
+
+    Raises
+    ------
+    ValueError
+        CASA cannot make coordinates of imsize, cell, projection and reffreq.
+    """
+    if grid.reffreq:
+        check_frequency(grid.reffreq, "reffreq")
+    with tempfile.TemporaryDirectory(prefix="casa_sara_") as folder:
+        root = os.path.join(folder, "plane")
+        _make_primary_beam(visibilities, selection, grid, root)
+        with opened("image", root + ".pb") as ia:
+            pb, mask = read_pixels(ia), read_pixels(ia, getmask=True)
+            csys, miscinfo = ia.coordsys().torecord(), ia.miscinfo()
+        with opened("table", root + ".pb") as tb:
+            imageinfo = tb.getkeyword("imageinfo")
+    kept = {key: miscinfo[key] for key in ("INSTRUME", "distance") if key in miscinfo}
+    return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept)
+
+
+def read_pixels(ia, getmask=False):
+    """Return the pixels (nx, ny) of an open image's first plane: float32, or bool for its mask."""
+    nx, ny, *rest = ia.shape()
+    pixels = np.empty((nx, ny), bool if getmask else np.float32)
+    for rows in slabs(nx, ny):
+        blc = [rows.start, 0] + [0] * len(rest)
+        trc = [rows.stop - 1, ny - 1] + [0] * len(rest)
+        pixels[rows] = ia.getchunk(blc, trc, getmask=getmask).reshape(rows.stop - rows.start, ny)
+    return pixels
+
+
+def slabs(nx, ny):
+    """Cut nx rows of ny pixels into slices of moderate size."""
+    step = max(1, _SLAB // ny)
+    return [slice(start, min(start + step, nx)) for start in range(0, nx, step)]
+
+
+def _make_primary_beam(visibilities, selection, grid, root):
+    """Write the image `root`.pb with synthesisimager, as tclean does."""
+    import casatools
+
+    imager, normalizer = casatools.synthesisimager(), casatools.synthesisnormalizer()
+    try:
+        for number in _by_start(visibilities):
+            imager.selectdata(_selection_record(selection, number))
+        try:
+            imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
+        except RuntimeError as error:
+            parameters = f"imsize = {list(grid.shape)}, projection = '{grid.projection}', reffreq = '{grid.reffreq}'"
+            raise ValueError(f"{parameters}: CASA makes no image of them: {str(error).strip()}") from error
+        imager.makepb()
+        imager.done()  # else it may write its own pixels over the normalised ones
+        normalizer.setupnormalizer({"imagename": root, "pblimit": PB_LIMIT, "nterms": 1, "normtype": "flatnoise"})
+        normalizer.normalizeprimarybeam()
+    finally:
+        imager.done()
+        normalizer.done()
+
+
+def _by_start(visibilities):
+    """Return the numbers of the MeasurementSets that hold data, by the time of their first row."""
+    starts = {}
+    for number in visibilities.spws:
+        with opened("table", visibilities.ms_names[number]) as tb:
+            starts[number] = tb.getcol("TIME").min()
+    return sorted(starts, key=starts.get)
+
+
+def _selection_record(selection, number):
+    """Return one MeasurementSet's selection in synthesisimager's words."""
+    import casatools
+
+    chosen = dict.fromkeys(("field", "spw", "timestr", "uvdist", "antenna", "scan", "obs", "state"), "")
+    chosen |= {_SELECTDATA_KEYS.get(parameter, parameter): value for parameter, value in selection.of(number).items()}
+    chosen |= {"msname": selection.vis[number], "datacolumn": selection.datacolumn, "savemodel": "none"}
+    utils = casatools.synthesisutils()
+    try:
+        return utils.checkselectionparams(chosen)
+    finally:
+        utils.done()
+
+
+def _image_record(visibilities, grid, root):
+    """Return the image definition in synthesisimager's words."""
+    center = visibilities.phase_center
+    longitude, latitude = (float(center[axis]["value"]) for axis in ("m0", "m1"))
+    return {
+        "imagename": root,
+        "imsize": [int(n) for n in grid.shape],
+        "cell": [f"{float(cell)!r}rad" for cell in grid.cell_rad],
+        "phasecenter": f"{center['refer']} {longitude!r}rad {latitude!r}rad",
+        "stokes": grid.stokes,
+        "projection": grid.projection,
+        "specmode": "mfs",
+        "reffreq": grid.reffreq,
+        "nchan": 1,
+        "outframe": "LSRK",
+        "deconvolver": "hogbom",
+    }

@@ -1,0 +1,101 @@
+"""The CASA log: the same file and the same words as the CASA tasks.
+
+INFO goes to the log file; CASA itself shows WARN and worse on the terminal too.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+import time
+
+__all__ = ["Progress", "error", "info", "warn"]
+
+ORIGIN = "tsara"
+
+
+def _sink():
+    """Return the log sink of casatasks, or one like it where casatasks is not loaded."""
+    return sys.modules["casatasks"].casalog if "casatasks" in sys.modules else _own_sink()
+
+
+@functools.cache
+def _own_sink():
+    """Return a sink to CASA's log file, which takes the messages of all casatools too."""
+    import casatools
+    from casaconfig import config
+
+    sink = casatools.logsink(config.logfile)
+    sink.setglobal(True)
+    return sink
+
+
+def info(message):
+    """Write a message to the CASA log."""
+    _sink().post(message, "INFO", ORIGIN)
+
+
+def warn(message):
+    """Write a warning to the CASA log, which also shows it on the terminal."""
+    _sink().post(message, "WARN", ORIGIN)
+
+
+def error(message):
+    """Write an error to the CASA log, which also shows it on the terminal."""
+    _sink().post(message, "SEVERE", ORIGIN)
+
+
+class Progress:
+    """Progress of an iteration: a line in the log now and then, and a live bar in a terminal.
+
+    Parameters
+    ----------
+    interval : int
+        Iterations between two lines of the log; the first iteration has one too.
+    stream : text stream
+        Where the bar is drawn, when it is a terminal.
+    """
+
+    WIDTH = 24
+
+    def __init__(self, interval=50, stream=None):
+        self._interval = interval
+        self._stream = sys.stderr if stream is None else stream
+        self._live = self._stream.isatty()
+        self._start = time.monotonic()
+
+    def __call__(self, iteration, message, fraction=None):
+        """Tell where iteration number `iteration` (from 1) stands.
+
+        Parameters
+        ----------
+        iteration : int
+        message : str
+        fraction : float, optional
+            Estimate of how much of the work is done, 0 to 1, from which the time left follows.
+        """
+        elapsed = time.monotonic() - self._start
+        left = f", about {_spell(elapsed * (1 / fraction - 1))} left" if fraction else ""
+        line = f"iteration {iteration}: {message}; {_spell(elapsed)}{left}"
+        if iteration == 1 or iteration % self._interval == 0:
+            info(line)
+        if self._live:
+            filled = round(self.WIDTH * min(fraction or 0, 1))
+            self._stream.write(f"\r[{'#' * filled}{'.' * (self.WIDTH - filled)}] {line}\033[K")
+            self._stream.flush()
+
+    def close(self):
+        """End the line of the bar."""
+        if self._live:
+            self._stream.write("\n")
+            self._stream.flush()
+
+
+def _spell(seconds):
+    """Spell a time span: '42 s', '3 min 20 s', '2 h 05 min'."""
+    seconds = round(seconds)
+    if seconds < 60:
+        return f"{seconds} s"
+    if seconds < 3600:
+        return f"{seconds // 60} min {seconds % 60:02d} s"
+    return f"{seconds // 3600} h {seconds // 60 % 60:02d} min"

@@ -1,0 +1,234 @@
+"""Stokes I visibilities out of MeasurementSets."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.casa.frames import Geometry, image_direction, separation
+from casa_sara.casa.selection import select_data
+from casa_sara.casa.tools import opened
+from casa_sara.visibilities import RowTable, Visibilities
+
+__all__ = ["read_visibilities"]
+
+_CHUNK = 400_000  # complex numbers read at a time
+_ONE_POINTING = 1e-6  # rad; fields closer than this share their primary beam
+_ROW_COLUMNS = {
+    "time": "TIME",
+    "interval": "INTERVAL",
+    "scan": "SCAN_NUMBER",
+    "observation": "OBSERVATION_ID",
+    "field": "FIELD_ID",
+    "antenna1": "ANTENNA1",
+    "antenna2": "ANTENNA2",
+}
+_ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64}
+
+
+def read_visibilities(selection, phasecenter="", stokes="I"):
+    """Read, select, flag, average to Stokes I and turn to one phase centre.
+
+    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one hand there is. A sample is left out
+    when any of its correlations is flagged (cross-hands too, as in tclean), when its row is
+    flagged or an autocorrelation, and when data, weights or uvw cannot be used; what was left
+    out is counted by the first reason that applies. Weights are WEIGHT_SPECTRUM where it is
+    filled, else WEIGHT, whatever the data column (as in tclean).
+
+    The inverse variance of Re V_I and of Im V_I follows from those of the hands:
+    Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
+    WEIGHT = 1/SIGMA² with SIGMA the scatter of the real and of the imaginary part.
+
+    The MeasurementSets are opened read-only and stay as they are, byte by byte.
+
+    Parameters
+    ----------
+    selection : casa_sara.options.Selection
+    phasecenter : str or int
+        Image centre in tclean's words; '' is the first selected field's.
+    stokes : str
+        Only 'I'.
+
+    Returns
+    -------
+    Visibilities
+
+    Raises
+    ------
+    ValueError, FileNotFoundError
+        When there is nothing to image, or what was asked for is not in the data.
+    """
+    if stokes != "I":
+        raise ValueError(f"stokes = '{stokes}' cannot be imaged: only stokes = 'I' can")
+    selected, notes = select_data(selection)
+    image = image_direction(phasecenter, selected)
+    table = _SampleTable()
+    low, high = np.inf, 0.0
+    for ms in selected:
+        geometry = Geometry(ms, image)
+        with opened("table", ms.name) as tb:
+            for group in ms.groups:
+                for chunk in _chunks(tb, ms, group):
+                    table.add(chunk, ms, group, geometry)
+        low, high = min(low, geometry.freq_range_hz[0]), max(high, geometry.freq_range_hz[1])
+    if table.size == 0:
+        raise ValueError(f"no sample of {', '.join(selection.vis)} can be used: {_counts(table.dropped)}")
+    return table.visibilities(
+        ms_names=tuple(selection.vis),
+        notes=notes + _notes(selected, table.dropped),
+        phase_center=image,
+        freq_range_hz=(low, high),
+        spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
+        observatory=selected[0].observatory,
+    )
+
+
+@dataclass
+class _Chunk:
+    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand of Stokes I."""
+
+    rows: np.ndarray
+    columns: dict[str, np.ndarray]
+    uvw_m: np.ndarray
+    vis: list[np.ndarray]
+    weight: list[np.ndarray]
+    flag: np.ndarray
+    flag_row: np.ndarray
+
+
+def _chunks(tb, ms, group):
+    """Read the rows of a group in pieces."""
+    weights = _weight_column(tb, group)
+    count = max(1, _CHUNK // (int(np.ptp(group.channels) + 1) * len(group.correlations)))
+    for start in range(0, group.rows.size, count):
+        rows = group.rows[start : start + count]
+        part = tb.selectrows(rows.tolist())
+        try:
+            yield _read(part, rows, ms.column, weights, group)
+        except RuntimeError as error:
+            raise RuntimeError(f"vis = '{ms.name}': rows {rows[0]} to {rows[-1]} cannot be read: {error}") from error
+        finally:
+            part.close()
+
+
+def _read(part, rows, column, weights, group):
+    """Read one piece."""
+    first = group.channels[0]
+    low, high = [0, int(first)], [len(group.correlations) - 1, int(group.channels[-1])]
+
+    def planes(name):
+        return [plane[group.channels - first].T for plane in part.getcolslice(name, low, high, [1, 1])]
+
+    if weights == "WEIGHT":
+        weight = [np.broadcast_to(row[:, None], (rows.size, group.channels.size)) for row in part.getcol("WEIGHT")]
+    else:
+        weight = planes(weights)
+    vis = planes(column)
+    return _Chunk(
+        rows=rows,
+        columns={name: part.getcol(of_ms) for name, of_ms in _ROW_COLUMNS.items()},
+        uvw_m=part.getcol("UVW"),
+        vis=[vis[hand] for hand in group.hands],
+        weight=[weight[hand] for hand in group.hands],
+        flag=np.any(planes("FLAG"), axis=0),
+        flag_row=part.getcol("FLAG_ROW"),
+    )
+
+
+def _weight_column(tb, group):
+    """Return the column that tclean takes the weights from."""
+    first = int(group.rows[0])
+    filled = "WEIGHT_SPECTRUM" in tb.colnames() and tb.iscelldefined("WEIGHT_SPECTRUM", first)
+    return "WEIGHT_SPECTRUM" if filled and tb.getcell("WEIGHT_SPECTRUM", first).size else "WEIGHT"
+
+
+class _SampleTable:
+    """The usable samples of all chunks so far."""
+
+    def __init__(self):
+        self.dropped = Counter()
+        self.size = 0
+        self._rows_so_far = 0
+        self._samples = {name: [] for name in ("vis", "weight", "imaging_weight", "uvw", "row", "chan")}
+        self._rows = {name: [] for name in RowTable.__dataclass_fields__}
+
+    def add(self, chunk, ms, group, geometry):
+        """Whiten, turn and append the usable samples of a chunk."""
+        ok = self._usable(chunk)
+        columns = chunk.columns
+        kept = ok.any(axis=1)
+        uvw, shift = geometry.wavelengths(group, columns["field"], columns["time"], np.where(kept, chunk.uvw_m, 0.0))
+        hands = len(chunk.vis)
+        vis = sum(hand[ok] for hand in chunk.vis) / hands
+        if shift is not None:
+            vis *= np.exp(-2j * np.pi * shift[ok])
+        weight = [hand[ok] for hand in chunk.weight]
+        number = self._rows_so_far + np.cumsum(kept) - 1
+        channel = np.broadcast_to(group.channels, ok.shape)
+        new = {
+            "vis": vis.astype(np.complex64),
+            "weight": (hands**2 / sum(1 / hand for hand in weight)).astype(np.float32),
+            "imaging_weight": (sum(weight) / hands).astype(np.float32),
+            "uvw": np.array([axis[ok] for axis in uvw]),
+            "row": np.repeat(number, ok.sum(axis=1)).astype(np.int32),
+            "chan": channel[ok].astype(np.int16),
+        }
+        for name, values in new.items():
+            self._samples[name].append(values)
+        columns = columns | {"row": chunk.rows, "ms": np.full(kept.size, ms.number), "spw": np.full(kept.size, group.spw)}
+        for name, values in columns.items():
+            self._rows[name].append(values[kept].astype(_ROW_DTYPES.get(name, np.int32)))
+        self._rows_so_far += int(kept.sum())
+        self.size += vis.size
+
+    def _usable(self, chunk):
+        """Return the bool (R, C) of samples to keep; count the others by the first reason that applies."""
+        autocorrelation = chunk.columns["antenna1"] == chunk.columns["antenna2"]
+        reasons = {
+            "autocorrelation": autocorrelation[:, None],
+            "flagged row": chunk.flag_row[:, None],
+            "flagged": chunk.flag,
+            "non-finite data": ~np.all([np.isfinite(hand) for hand in chunk.vis], axis=0),
+            "non-finite weight": ~np.all([np.isfinite(hand) for hand in chunk.weight], axis=0),
+            "non-positive weight": np.any([hand <= 0 for hand in chunk.weight], axis=0),
+            "non-finite uvw": ~np.isfinite(chunk.uvw_m).all(axis=0)[:, None],
+        }
+        ok = np.ones(chunk.flag.shape, dtype=bool)
+        for reason, bad in reasons.items():
+            self.dropped[reason] += int(np.count_nonzero(ok & bad))
+            ok &= ~bad
+        return ok
+
+    def visibilities(self, **about):
+        """Join the chunks, one column after the other to keep the peak of memory low."""
+        samples, rows = ({name: _join(lists, name) for name in tuple(lists)} for lists in (self._samples, self._rows))
+        dropped = {reason: count for reason, count in self.dropped.items() if count}
+        return Visibilities(**samples, rows=RowTable(**rows), dropped=dropped, **about)
+
+
+def _join(lists, name):
+    """Take a list of arrays out of `lists` and concatenate it along the last axis."""
+    return np.concatenate(lists.pop(name), axis=-1)
+
+
+def _counts(dropped):
+    """Spell the dropped samples for a message."""
+    return ", ".join(f"{count} samples left out as {reason}" for reason, count in dropped.items() if count)
+
+
+def _notes(selected, dropped):
+    """Return the warnings that the data themselves give rise to."""
+    notes = []
+    unusable = {reason: count for reason, count in dropped.items() if reason.startswith("non-")}
+    if any(unusable.values()):
+        notes.append(f"unflagged samples cannot be used: {_counts(unusable)}")
+    centres = [(ms, field) for ms in selected for field in ms.fields]
+    spread = max(separation(ms.fields[field], centres[0][0].fields[centres[0][1]]) for ms, field in centres)
+    if spread > _ONE_POINTING:
+        notes.append(
+            f"{len(centres)} fields, up to {np.degrees(spread) * 3600:.1f} arcsec apart, are imaged as one pointing: "
+            "primary beams are not taken into account"
+        )
+    return notes

@@ -1,0 +1,37 @@
+"""Numbers with units out of task parameters."""
+
+from __future__ import annotations
+
+__all__ = ["check_frequency", "radians"]
+
+
+def radians(text, parameter):
+    """Return the angle `text`, as '0.5arcsec', in radians.
+
+    Raises
+    ------
+    ValueError
+        It is not an angle; the message names `parameter`.
+    """
+    if not _is(text, "rad"):
+        raise ValueError(f"{parameter} = '{text}' is not an angle: it takes a number with its unit, as '0.5arcsec'")
+    import casatools
+
+    return casatools.quanta().convert(text, "rad")["value"]
+
+
+def check_frequency(text, parameter):
+    """Raise ValueError unless `text` is a frequency, as '1.4GHz'."""
+    if not _is(text, "Hz"):
+        raise ValueError(f"{parameter} = '{text}' is not a frequency: it takes a number with its unit, as '1.4GHz'")
+
+
+def _is(text, unit):
+    """Tell whether a quantity has the dimension of this unit."""
+    import casatools
+
+    quanta = casatools.quanta()
+    try:
+        return quanta.compare(text, unit) or (unit == "rad" and quanta.isangle(text))
+    except RuntimeError:
+        return False

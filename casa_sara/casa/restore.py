@@ -1,0 +1,110 @@
+"""Restoring beam and restored image, made by the code behind tclean."""
+
+from __future__ import annotations
+
+import math
+import os
+import tempfile
+
+from casa_sara.casa.images import write_image
+from casa_sara.casa.quantities import radians
+from casa_sara.casa.tools import opened
+
+__all__ = ["fit_beam", "restore", "restoring_beam_words"]
+
+PSF_CUTOFF = 0.35  # of tclean: the Gaussian is fitted to the PSF above this fraction of its peak
+
+
+def fit_beam(psf, plane):
+    """Fit the restoring beam to the main lobe of the PSF.
+
+    Parameters
+    ----------
+    psf : float32 (nx, ny), 1 at the centre
+    plane : ImagePlane
+
+    Returns
+    -------
+    beam : dict
+        {'major', 'minor', 'positionangle'}, each a CASA quantity.
+
+    Raises
+    ------
+    ValueError
+        The PSF has no main lobe that could be fitted.
+    """
+    import casatools
+
+    utils = casatools.synthesisutils()
+    with tempfile.TemporaryDirectory(prefix="casa_sara_") as folder:
+        root = os.path.join(folder, "beam")
+        write_image(root + ".psf", psf, plane)
+        try:
+            utils.fitPsfBeam(imagename=root, nterms=1, psfcutoff=PSF_CUTOFF)
+        finally:
+            utils.done()
+        with opened("image", root + ".psf") as ia:
+            beam = ia.restoringbeam()
+    cell = abs(plane.csys["direction0"]["cdelt"]).min() * 180 * 3600 / math.pi
+    if not beam or not cell / 10 < beam["minor"]["value"] < math.inf:
+        raise ValueError(f"no beam could be fitted to the PSF: cell = '{cell:.4g}arcsec' is too large, or imsize too small")
+    return beam
+
+
+def restoring_beam_words(restoringbeam):
+    """Return tclean's `restoringbeam` as a list of strings, empty for the fitted beam.
+
+    Parameters
+    ----------
+    restoringbeam : str or sequence
+        '' or [] or 'common' (the same in an image of one channel), one angle for a circular
+        beam, or [major, minor, position angle].
+
+    Raises
+    ------
+    ValueError
+        It is something else.
+    """
+    words = [restoringbeam] if isinstance(restoringbeam, str) else [str(word) for word in restoringbeam]
+    words = [word.strip() for word in words if word.strip()]
+    if words in ([], ["common"]):
+        return []
+    if len(words) not in (1, 3):
+        raise ValueError(f"restoringbeam = {words} takes one angle, or [major, minor, position angle]")
+    axes = [radians(word, "restoringbeam") for word in words[:2]]
+    if min(axes) <= 0 or axes[0] < axes[-1]:
+        raise ValueError(f"restoringbeam = {words}: the axes are positive, the major one first")
+    if len(words) == 3:
+        radians(words[2], "restoringbeam")
+    return words
+
+
+def restore(root, restoringbeam=()):
+    """Write `root`.image = `root`.model ∗ beam + `root`.residual, in Jy/beam.
+
+    The residual is smoothed to the beam too, as in tclean, when the beam is not the fitted
+    one and larger. Needs `root`.psf with its beam, `root`.residual and `root`.model.
+
+    Parameters
+    ----------
+    root : str
+    restoringbeam : str or sequence
+        See `restoring_beam_words`.
+    """
+    import casatools
+
+    deconvolver = casatools.synthesisdeconvolver()
+    try:
+        deconvolver.setupdeconvolution(
+            {
+                "imagename": root,
+                "deconvolver": "hogbom",
+                "specmode": "mfs",
+                "usemask": "user",
+                "startmodel": "",
+                "restoringbeam": restoring_beam_words(restoringbeam),
+            }
+        )
+        deconvolver.restore()
+    finally:
+        deconvolver.done()

@@ -1,0 +1,236 @@
+"""Which rows, channels and correlations of the MeasurementSets are wanted, and whether they can be had.
+
+The selection strings go to CASA's own parser (MSSelection, the one behind tclean), so they
+mean here what they mean there. Everything that can be wrong with the input is said here,
+before anything is computed. Nothing is written to the MeasurementSets.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.casa.msselect import MSSELECT_KEYS, in_words, msselect
+from casa_sara.casa.tools import opened
+
+__all__ = ["RowGroup", "SelectedMS", "select_data"]
+
+_DATA_COLUMNS = {"corrected": "CORRECTED_DATA", "data": "DATA", "observed": "DATA"}
+_STOKES_CODES = {1: "I", 5: "RR", 6: "RL", 7: "LR", 8: "LL", 9: "XX", 10: "XY", 11: "YX", 12: "YY"}
+_LAST_CHANNEL = 32767
+_HANDS = ({5, 8}, {9, 12})
+_SINGLE = {1, 5, 8, 9, 12}
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """The selected rows of one data description, which share frequencies and correlations.
+
+    Attributes
+    ----------
+    spw : int
+    rows : int64 (R,), row numbers in the MeasurementSet
+    channels : int64 (C,), selected channel numbers, increasing
+    freqs_hz, widths_hz : float64 (C,), centres and widths in `frame`
+    frame : str, reference of the frequencies ('TOPO', 'LSRK', …)
+    hands : tuple of one or two int, where Stokes I's correlations stand
+    correlations : tuple of str, all the correlations of the rows
+    """
+
+    spw: int
+    rows: np.ndarray
+    channels: np.ndarray
+    freqs_hz: np.ndarray
+    widths_hz: np.ndarray
+    frame: str
+    hands: tuple[int, ...]
+    correlations: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SelectedMS:
+    """One MeasurementSet with what is selected of it.
+
+    Attributes
+    ----------
+    number : int, its place in `vis`
+    name : str
+    column : str, the data column to read
+    groups : tuple of RowGroup
+    fields : dict, selected field number → phase centre (direction measure)
+    observatory : str, and `position`, its position measure
+    """
+
+    number: int
+    name: str
+    column: str
+    groups: tuple[RowGroup, ...]
+    fields: dict[int, dict]
+    observatory: str
+    position: dict
+
+
+def select_data(selection):
+    """Apply the selection to every MeasurementSet.
+
+    Parameters
+    ----------
+    selection : casa_sara.options.Selection
+
+    Returns
+    -------
+    selected : list of SelectedMS
+        Those of `vis` of which at least one row is selected.
+    notes : list of str
+        Warnings for the user.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        With the parameter's name, its value and what would be right.
+    """
+    _check_parameters(selection)
+    selected, notes, empty = [], [], []
+    for number, name in enumerate(selection.vis):
+        _check_measurement_set(name)
+        rows, channels = msselect(name, selection.of(number))
+        if rows.size == 0:
+            empty.append(f"{in_words(selection.of(number))} leaves no rows of '{name}'")
+            continue
+        column = _data_column(name, selection.datacolumn, notes)
+        selected.append(_describe(number, name, column, rows, channels, notes))
+    if not selected:
+        raise ValueError("the data selection leaves nothing to image: " + "; ".join(empty))
+    return selected, notes + [f"{reason}: nothing of it is imaged" for reason in empty]
+
+
+def _check_parameters(selection):
+    """Raise on what can be seen without opening anything."""
+    if not selection.vis:
+        raise ValueError("vis is empty: it takes the name of a MeasurementSet, or a list of names")
+    if selection.datacolumn not in _DATA_COLUMNS:
+        raise ValueError(f"datacolumn = '{selection.datacolumn}' is not one of 'corrected', 'data'")
+    for parameter in MSSELECT_KEYS:
+        value = getattr(selection, parameter)
+        if not isinstance(value, str) and len(value) != len(selection.vis):
+            raise ValueError(
+                f"{parameter} = {list(value)} has {len(value)} entries for {len(selection.vis)} MeasurementSets "
+                "in vis: it takes one string for all of them, or one for each"
+            )
+
+
+def _check_measurement_set(name):
+    """Raise unless `name` is a MeasurementSet with rows."""
+    if not os.path.exists(name):
+        raise FileNotFoundError(f"vis = '{name}' does not exist")
+    if not os.path.isdir(name):
+        raise ValueError(f"vis = '{name}' is a file: a MeasurementSet is a directory (importuvfits makes one of a UVFITS file)")
+    if not os.path.exists(os.path.join(name, "table.dat")):
+        raise ValueError(f"vis = '{name}' is a directory, but not a MeasurementSet: it holds no table.dat")
+    try:
+        with opened("table", name) as tb:
+            is_ms, rows = {"UVW", "ANTENNA1", "DATA_DESC_ID", "FLAG"} <= set(tb.colnames()), tb.nrows()
+    except RuntimeError as error:
+        raise ValueError(f"vis = '{name}' cannot be opened as a table: {error}") from error
+    if not is_ms:
+        raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet")
+    if rows == 0:
+        raise ValueError(f"vis = '{name}' is a MeasurementSet without rows")
+
+
+def _data_column(name, datacolumn, notes):
+    """Return the column to read, DATA with a note where CORRECTED_DATA is asked for and absent."""
+    with opened("table", name) as tb:
+        columns = set(tb.colnames())
+    wanted = _DATA_COLUMNS[datacolumn]
+    if wanted in columns:
+        return wanted
+    if "DATA" in columns:
+        notes.append(f"datacolumn = '{datacolumn}', but '{name}' has no {wanted} column: DATA is imaged instead")
+        return "DATA"
+    if "FLOAT_DATA" in columns:
+        raise ValueError(f"vis = '{name}' holds single-dish data (FLOAT_DATA): only interferometer data can be imaged")
+    raise ValueError(f"datacolumn = '{datacolumn}': '{name}' has neither {wanted} nor DATA")
+
+
+def _describe(number, name, column, rows, channels, notes):
+    """Return the SelectedMS of these rows."""
+    with opened("table", name) as tb:
+        description = tb.getcol("DATA_DESC_ID")[rows]
+        field_ids = np.unique(tb.getcol("FIELD_ID")[rows])
+        observation = int(tb.getcell("OBSERVATION_ID", int(rows[0])))
+        for first in (int(rows[description == dd][0]) for dd in np.unique(description)):
+            if not tb.iscelldefined(column, first):
+                raise ValueError(f"the {column} column of '{name}' is empty at row {first}")
+    _refuse_moving(name, field_ids)
+    with opened("msmetadata", name) as md:
+        groups = []
+        for dd in np.unique(description):
+            spw = md.spwfordatadesc(int(dd))
+            codes = np.ravel(md.corrtypesforpol(md.polidfordatadesc(int(dd)))).tolist()
+            chosen = channels.get(spw, np.arange(md.nchan(spw)))
+            if chosen[-1] > _LAST_CHANNEL:
+                raise ValueError(f"spw: channel {chosen[-1]} of spw {spw} in '{name}' is beyond {_LAST_CHANNEL}, the last that can be imaged")
+            groups.append(
+                RowGroup(
+                    spw=spw,
+                    rows=rows[description == dd],
+                    channels=chosen,
+                    freqs_hz=md.chanfreqs(spw)[chosen],
+                    widths_hz=np.abs(md.chanwidths(spw))[chosen],
+                    frame=md.reffreq(spw)["refer"],
+                    hands=_parallel_hands(name, spw, codes, notes),
+                    correlations=tuple(_STOKES_CODES.get(code, str(code)) for code in codes),
+                )
+            )
+        return SelectedMS(
+            number=number,
+            name=name,
+            column=column,
+            groups=tuple(groups),
+            fields={int(field): md.phasecenter(int(field)) for field in field_ids},
+            observatory=md.observatorynames()[observation],
+            position=_position(md, observation),
+        )
+
+
+def _position(md, observation):
+    """Return where the telescope stands: its first antenna if CASA does not know the name, as in tclean."""
+    try:
+        return md.observatoryposition(observation)
+    except RuntimeError:
+        return md.antennaposition(0)
+
+
+def _parallel_hands(name, spw, codes, notes):
+    """Return where in `codes` the correlations stand whose mean is Stokes I."""
+    for pair in _HANDS:
+        if pair <= set(codes):
+            return tuple(codes.index(code) for code in sorted(pair))
+    if len(codes) == 1 and codes[0] in _SINGLE:
+        if codes[0] != 1:
+            note = f"'{name}' holds {_STOKES_CODES[codes[0]]} alone: it is imaged as Stokes I, as if the source were unpolarised"
+            if note not in notes:
+                notes.append(note)
+        return (0,)
+    names = ", ".join(_STOKES_CODES.get(code, f"type {code}") for code in codes)
+    raise ValueError(
+        f"stokes = 'I' cannot be formed from the correlations {names} of spw {spw} in '{name}': "
+        "it takes RR and LL, or XX and YY, or one of them alone; other spws can be selected with spw"
+    )
+
+
+def _refuse_moving(name, field_ids):
+    """Raise when a selected field moves on the sky: its phase centre is not one direction."""
+    with opened("table", os.path.join(name, "FIELD")) as tb:
+        moving = tb.getcol("NUM_POLY")[field_ids] > 0
+        if "EPHEMERIS_ID" in tb.colnames():
+            moving |= tb.getcol("EPHEMERIS_ID")[field_ids] >= 0
+        names = np.array(tb.getcol("NAME"))[field_ids]
+    if moving.any():
+        raise ValueError(
+            f"field {field_ids[moving].tolist()} ({', '.join(names[moving])}) of '{name}' moves on the sky "
+            "(ephemeris or polynomial): moving sources cannot be imaged, select other fields"
+        )

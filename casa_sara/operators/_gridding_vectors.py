@@ -1,0 +1,138 @@
+"""Explicit vectors for the short loops of gridding, inside numba functions.
+
+LLVM's own vectoriser leaves these loops scalar, which costs a factor of five.  A `Lanes` is a
+value of a fixed number of lanes, which LLVM maps to the registers that the processor has.  The
+number comes from the length of a tuple, so it is a constant of the compiled function.
+"""
+
+from __future__ import annotations
+
+import functools
+
+from llvmlite import ir
+from numba.core import types
+from numba.core.datamodel import models
+from numba.extending import intrinsic, register_model
+
+__all__ = ["element", "load", "multiply", "multiply_add", "pair_sums", "polynomials", "scale_pairs", "store"]
+
+INT = ir.IntType(32)
+
+
+class Lanes(types.Type):
+    """`count` numbers of one floating-point type."""
+
+    def __init__(self, scalar, count):
+        self.scalar, self.count = scalar, count
+        super().__init__(name=f"Lanes({scalar}, {count})")
+
+
+@register_model(Lanes)
+class _LanesModel(models.PrimitiveModel):
+    def __init__(self, dmm, lanes):
+        scalar = ir.FloatType() if lanes.scalar == types.float32 else ir.DoubleType()
+        super().__init__(dmm, lanes, ir.VectorType(scalar, lanes.count))
+
+
+def _pointer(context, builder, array_type, array, index, lanes):
+    """Address of array[index] as a pointer to lanes."""
+    data = context.make_array(array_type)(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [index]), context.get_value_type(lanes).as_pointer())
+
+
+def _cycle(builder, values, vector):
+    """The given scalars, again and again."""
+    undefined = start = ir.Constant(vector, ir.Undefined)
+    for lane, value in enumerate(values):
+        start = builder.insert_element(start, value, INT(lane))
+    pattern = [lane % len(values) for lane in range(vector.count)]
+    return builder.shuffle_vector(start, undefined, ir.Constant(ir.VectorType(INT, len(pattern)), pattern))
+
+
+def _multiply_add(builder, lanes, scalar, addend):
+    """lanes · scalar + addend, fused where the processor can."""
+    product = builder.fmul(lanes, _cycle(builder, [scalar], lanes.type), flags=("contract",))
+    return builder.fadd(product, addend, flags=("contract",))
+
+
+@intrinsic
+def load(typing_context, array, index, count):
+    """len(count) consecutive elements of a contiguous 1-D array from `index` on."""
+    lanes = Lanes(array.dtype, len(count))
+
+    def codegen(context, builder, signature, args):
+        pointer = _pointer(context, builder, array, args[0], args[1], lanes)
+        return builder.load(pointer, align=array.dtype.bitwidth // 8)
+
+    return lanes(array, types.intp, count), codegen
+
+
+@intrinsic
+def store(typing_context, array, index, lanes):
+    """Write lanes to consecutive elements of a contiguous 1-D array from `index` on."""
+
+    def codegen(context, builder, signature, args):
+        pointer = _pointer(context, builder, array, args[0], args[1], lanes)
+        builder.store(args[2], pointer, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, lanes), codegen
+
+
+@intrinsic
+def multiply(typing_context, left, right):
+    """left · right."""
+    return left(left, left), lambda context, builder, signature, args: builder.fmul(*args)
+
+
+@intrinsic
+def multiply_add(typing_context, lanes, scalar, addend):
+    """lanes · scalar + addend."""
+    return lanes(lanes, lanes.scalar, lanes), lambda context, builder, signature, args: _multiply_add(builder, *args)
+
+
+@intrinsic
+def scale_pairs(typing_context, lanes, even, odd):
+    """Even lanes times `even`, odd lanes times `odd`."""
+
+    def codegen(context, builder, signature, args):
+        return builder.fmul(args[0], _cycle(builder, args[1:], args[0].type))
+
+    return lanes(lanes, lanes.scalar, lanes.scalar), codegen
+
+
+@intrinsic
+def element(typing_context, lanes, lane):
+    """The number in one lane."""
+    return lanes.scalar(lanes, types.intp), lambda context, builder, signature, args: builder.extract_element(*args)
+
+
+@intrinsic
+def pair_sums(typing_context, lanes):
+    """(sum of the even lanes, sum of the odd lanes); the number of lanes is a power of two."""
+    pair = types.UniTuple(lanes.scalar, 2)
+
+    def codegen(context, builder, signature, args):
+        rest, count = args[0], lanes.count
+        while count > 2:
+            count //= 2
+            lower, upper = (ir.Constant(ir.VectorType(INT, count), list(range(start, start + count)))
+                            for start in (0, count))
+            rest = builder.fadd(*(builder.shuffle_vector(rest, rest, half) for half in (lower, upper)))
+        return context.make_tuple(builder, pair, [builder.extract_element(rest, INT(k)) for k in range(2)])
+
+    return pair(lanes), codegen
+
+
+@intrinsic
+def polynomials(typing_context, coefs, t, terms, count):
+    """len(count) polynomials at t; `coefs` is (len(terms), len(count)) flattened, highest power first."""
+    lanes = Lanes(coefs.dtype, len(count))
+
+    def codegen(context, builder, signature, args):
+        offsets = [ir.IntType(64)(term * lanes.count) for term in range(len(terms))]
+        pointers = [_pointer(context, builder, coefs, args[0], offset, lanes) for offset in offsets]
+        rows = [builder.load(pointer, align=coefs.dtype.bitwidth // 8) for pointer in pointers]
+        return functools.reduce(lambda value, row: _multiply_add(builder, value, args[1], row), rows)
+
+    return lanes(coefs, coefs.dtype, terms, count), codegen

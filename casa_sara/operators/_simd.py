@@ -1,0 +1,219 @@
+"""Vector registers for Numba kernels, and the short filters that run on them.
+
+LLVM's own vectoriser fails on wavelet filters: it cannot prove that sixteen input lines and the output do not
+overlap, it halves the register width, and it does not unroll the taps.  The kernels therefore say what they mean:
+a `Vector` is as wide as the processor's registers, `load` and `store` move it between a register and an address in
+memory (a plain integer), and `filter_bank` makes the unrolled weighted sums.
+"""
+
+from __future__ import annotations
+
+import operator
+
+import llvmlite.binding as llvm
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.extending import intrinsic, overload, register_model
+
+__all__ = ["VECTOR_BYTES", "MAX_TAPS", "Vector", "filter_bank", "load", "load_first", "store", "store_first",
+           "splat", "minimum", "maximum", "evens", "odds", "zip_low", "zip_high"]
+
+MAX_TAPS = 16
+INT, LANE = ir.IntType(64), ir.IntType(32)
+
+
+def _register_bytes():
+    features = llvm.get_host_cpu_features()
+    return 64 if features.get("avx512f") else 32 if features.get("avx") else 16
+
+
+VECTOR_BYTES = _register_bytes()
+
+
+class Vector(types.Type):
+    """Numba type of one register full of `scalar`."""
+
+    def __init__(self, scalar):
+        self.scalar, self.size = scalar, scalar.bitwidth // 8
+        self.width = VECTOR_BYTES // self.size
+        super().__init__(name=f"Vector({scalar}, {self.width})")
+
+    @property
+    def llvm(self):
+        return ir.VectorType(ir.FloatType() if self.size == 4 else ir.DoubleType(), self.width)
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, dmm, fe_type):
+        super().__init__(dmm, fe_type, fe_type.llvm)
+
+
+def _splat(builder, scalar, vector):
+    undefined = ir.Constant(vector, ir.Undefined)
+    first = builder.insert_element(undefined, scalar, ir.Constant(LANE, 0))
+    return builder.shuffle_vector(first, undefined, ir.Constant(ir.VectorType(LANE, vector.count), [0] * vector.count))
+
+
+def _move(builder, vec, address, value=None, lanes=None):
+    """Load from (`value` None) or store to `address`; only the first `lanes` lanes where given, the rest reads 0."""
+    pointer = builder.inttoptr(address, vec.llvm.as_pointer())
+    if lanes is None:
+        return builder.load(pointer, align=vec.size) if value is None else builder.store(value, pointer, align=vec.size)
+    numbers = ir.Constant(ir.VectorType(LANE, vec.width), list(range(vec.width)))
+    mask = builder.icmp_signed("<", numbers, _splat(builder, builder.trunc(lanes, LANE), numbers.type))
+    kind, result, before, after = ("load", vec.llvm, [], [ir.Constant(vec.llvm, None)]) if value is None else \
+        ("store", ir.VoidType(), [value], [])
+    arguments = [*before, pointer, ir.Constant(LANE, vec.size), mask, *after]
+    function = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(result, [a.type for a in arguments]),
+        f"llvm.masked.{kind}.v{vec.width}f{8 * vec.size}.p0")
+    return builder.call(function, arguments)
+
+
+@intrinsic
+def load(typingctx, address, like):
+    """Vector at `address`, of the type of `like`."""
+    vec = like
+    return vec(types.intp, like), lambda context, builder, sig, args: _move(builder, vec, args[0])
+
+
+@intrinsic
+def load_first(typingctx, address, lanes, like):
+    """As `load`, but touches only the first `lanes` values; the other lanes are 0."""
+    vec = like
+    return vec(types.intp, types.intp, like), lambda context, builder, sig, args: _move(
+        builder, vec, args[0], lanes=args[1])
+
+
+@intrinsic
+def store(typingctx, address, value):
+    """Write a vector to `address`."""
+    def codegen(context, builder, sig, args):
+        _move(builder, sig.args[1], *args)
+    return types.void(types.intp, value), codegen
+
+
+@intrinsic
+def store_first(typingctx, address, value, lanes):
+    """Write the first `lanes` values of a vector to `address`."""
+    def codegen(context, builder, sig, args):
+        _move(builder, sig.args[1], *args)
+    return types.void(types.intp, value, types.intp), codegen
+
+
+@intrinsic
+def splat(typingctx, scalar):
+    """Vector with `scalar` in every lane."""
+    vec = Vector(scalar)
+    return vec(scalar), lambda context, builder, sig, args: _splat(builder, args[0], vec.llvm)
+
+
+def _binary(build):
+    @intrinsic
+    def operation(typingctx, a, b):
+        return a(a, b), lambda context, builder, sig, args: build(builder, *args)
+    return operation
+
+
+def _lanes(pick):
+    """Two vectors of n lanes to one: lane i is number pick(i, n) of the 2n."""
+    def build(builder, a, b):
+        n = a.type.count
+        return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(LANE, n), [pick(i, n) for i in range(n)]))
+    return _binary(build)
+
+
+evens = _lanes(lambda i, n: 2 * i)
+odds = _lanes(lambda i, n: 2 * i + 1)
+zip_low = _lanes(lambda i, n: i // 2 + i % 2 * n)
+zip_high = _lanes(lambda i, n: (i + n) // 2 + i % 2 * n)
+minimum = _binary(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
+maximum = _binary(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+
+
+def _overload(symbol, build):
+    operation = _binary(build)
+
+    @overload(symbol)
+    def implementation(a, b):
+        if isinstance(a, Vector) and a == b:
+            return lambda a, b: operation(a, b)
+
+
+_overload(operator.add, lambda builder, a, b: builder.fadd(a, b))
+_overload(operator.sub, lambda builder, a, b: builder.fsub(a, b))
+_overload(operator.mul, lambda builder, a, b: builder.fmul(a, b))
+_overload(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
+
+
+def filter_bank(lags, masked=False):
+    """Make the kernel of a bank of short filters, unrolled for every even length up to MAX_TAPS.
+
+    The kernel is called as ``bank(lines, offsets, taps, length, lanes)`` and returns the tuple of vectors
+
+        sum[n · len(lags) + o] = Σ_{t < length} taps[o mod 2, t] · vector at (lines[t + lag_o] + offsets[n]),
+
+    where `lines` is an int64 array of addresses, `offsets` a tuple of byte offsets and `taps` an array (2, ≥ length).
+    Every input vector is loaded once and every tap broadcast once.
+
+    Parameters
+    ----------
+    lags : callable
+        Number of taps to the tuple of lags of the outputs.
+    masked : bool
+        Touch only the first `lanes` values of each line; without it `lanes` is ignored.
+    """
+    @intrinsic
+    def bank(typingctx, lines, offsets, taps, length, lanes):
+        vec = Vector(taps.dtype)
+        sums = types.UniTuple(vec, len(offsets) * len(lags(2)))
+
+        def codegen(context, builder, sig, args):
+            address = context.make_array(lines)(context, builder, args[0]).data
+            tap = context.make_array(taps)(context, builder, args[2])
+            row = builder.udiv(cgutils.unpack_tuple(builder, tap.strides)[0], ir.Constant(INT, vec.size))
+            starts = [tap.data, builder.gep(tap.data, [row])]
+            shifts = cgutils.unpack_tuple(builder, args[1])
+            done = builder.append_basic_block("done")
+            cases = {n: builder.append_basic_block(f"taps{n}") for n in range(2, MAX_TAPS + 1, 2)}
+            switch = builder.switch(args[3], cases[MAX_TAPS])
+            results = []
+            for n, block in cases.items():
+                if n < MAX_TAPS:
+                    switch.add_case(ir.Constant(INT, n), block)
+                builder.position_at_end(block)
+                results.append(_unrolled(builder, vec, n, lags(n), address, starts, shifts,
+                                         args[4] if masked else None))
+                builder.branch(done)
+            builder.position_at_end(done)
+            merged = [builder.phi(vec.llvm) for _ in range(len(sums))]
+            for values, block in zip(results, cases.values()):
+                for phi, value in zip(merged, values):
+                    phi.add_incoming(value, block)
+            return cgutils.pack_array(builder, merged)
+
+        return sums(lines, offsets, taps, types.intp, types.intp), codegen
+
+    return bank
+
+
+def _unrolled(builder, vec, length, lags, lines, taps, offsets, lanes):
+    """The sums of `filter_bank` for one filter length."""
+    sums = [[None] * len(lags) for _ in offsets]
+    factors = []
+    for p in range(length + max(lags)):
+        index = [ir.Constant(INT, p)]
+        line = builder.load(builder.gep(lines, index))
+        if p < length:
+            factors.append([_splat(builder, builder.load(builder.gep(row, index)), vec.llvm) for row in taps])
+        for n, offset in enumerate(offsets):
+            value = _move(builder, vec, builder.add(line, offset), lanes=lanes)
+            for o, lag in enumerate(lags):
+                if 0 <= p - lag < length:
+                    term = builder.fmul(factors[p - lag][o % 2], value, flags=["contract"])
+                    old = sums[n][o]
+                    sums[n][o] = term if old is None else builder.fadd(term, old, flags=["contract"])
+    return sum(sums, [])

@@ -1,0 +1,28 @@
+"""Threads for compiled kernels that release Python's lock.
+
+Threads of a pool sleep while there is nothing to do; those of an OpenMP runtime spin, and
+would take the processor from the next stage.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+
+__all__ = ["Workers"]
+
+
+class Workers:
+    """A fixed number of threads that share the work of each call."""
+
+    def __init__(self, count):
+        self.count = int(count)
+        if self.count < 1:
+            raise ValueError(f"nthreads={count} must be at least 1")
+        self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
+
+    def run(self, kernel, *args):
+        """Call kernel(*args, worker, count) for each worker, all at once, and wait."""
+        others = [self._pool.submit(kernel, *args, worker, self.count) for worker in range(1, self.count)]
+        kernel(*args, 0, self.count)
+        for other in others:
+            other.result()

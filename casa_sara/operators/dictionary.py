@@ -1,0 +1,237 @@
+"""The SARA dictionary Ψ: Dirac and Daubechies bases whose concatenation is a Parseval frame.
+
+Each basis is orthonormal (Daubechies wavelets with periodic boundaries) and is scaled by 1/√b, b the number of
+bases, so that Ψ Ψ† = I and ‖Ψ‖ = 1.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import pywt
+
+from casa_sara.operators import _wavelet_kernels as kernels
+from casa_sara.options import SARA_BASES
+
+__all__ = ["Band", "SaraDictionary"]
+
+CACHE_LINE = 64
+ORIENTATIONS = ("aa", "ad", "da", "dd")
+
+
+class Band(NamedTuple):
+    """Where one band lies: `coefs[band.slice]` is its 2-D array."""
+
+    basis: int
+    level: int
+    orientation: str
+    slice: tuple[int, slice, slice]
+
+
+class SaraDictionary:
+    """Ψ† (analysis), Ψ (synthesis) and the dual update of the ℓ1 prior.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Image size (nx, ny), any size ≥ 1.
+    wavelets : sequence of str
+        Bases: 'dirac' and 'db1' … 'db8', each at most once.
+    levels : int
+        Number of decomposition levels ≥ 1.
+    dtype : float32 or float64
+        Of images and coefficients.
+    nthreads : int
+        Threads used by each call; the results do not depend on it.
+
+    Attributes
+    ----------
+    coef_shape : (int, int, int)
+        (number of bases, NX, NY): each basis in the usual nested quadrants of a plane padded with zeros to the
+        next multiple of 2**levels.  Dirac coefficients are the pixels, in the corner [:nx, :ny] of their plane.
+
+    Raises
+    ------
+    ValueError
+        For an argument out of these ranges; the message names it.
+    """
+
+    def __init__(self, shape, wavelets=SARA_BASES, levels=4, dtype=np.float32, nthreads=1):
+        self.shape = tuple(int(n) for n in shape)
+        self.wavelets = tuple(wavelets)
+        self.levels, self.nthreads, self.dtype = int(levels), int(nthreads), np.dtype(dtype)
+        self._validate()
+        self.n_bases = len(self.wavelets)
+        block = 1 << self.levels
+        padded = tuple(-(-n // block) * block for n in self.shape)
+        self.coef_shape = (self.n_bases, *padded)
+        self.n_coefs = self.n_bases * padded[0] * padded[1]
+        self._filters = _filters(self.wavelets, self.dtype)
+        self._owner = _shares(self._filters.lengths, self.nthreads)
+        self._work = self._workspaces()
+        self._params = np.zeros((self.n_bases, self.levels, 4), self.dtype)
+        self._pool = ThreadPoolExecutor(self.nthreads - 1) if self.nthreads > 1 else None
+
+    def _validate(self):
+        if len(self.shape) != 2 or min(self.shape) < 1:
+            raise ValueError(f"imsize must be two sizes of at least 1 pixel, not {self.shape}")
+        if not self.wavelets or len(set(self.wavelets)) < len(self.wavelets) or set(self.wavelets) - set(SARA_BASES):
+            raise ValueError(f"wavelets={list(self.wavelets)} must be distinct names out of {list(SARA_BASES)}")
+        if not 1 <= self.levels <= 16:
+            raise ValueError(f"wavelevels={self.levels} must be between 1 and 16")
+        if self.dtype not in (np.float32, np.float64):
+            raise ValueError(f"dtype must be float32 or float64, not {self.dtype}")
+        if self.nthreads < 1:
+            raise ValueError(f"nthreads={self.nthreads} must be at least 1")
+
+    def _workspaces(self):
+        nx, ny = self.coef_shape[1:]
+        size = self.dtype.itemsize
+        approx = sum((nx >> level) * kernels.padded_width(ny >> level, size) for level in range(1, self.levels + 1))
+        return kernels.Work(
+            approx=_aligned((self.n_bases, approx), self.dtype),
+            window=_aligned((self.nthreads, kernels.WINDOW_ROWS, kernels.padded_width(ny, size)), self.dtype),
+            scratch=_aligned((self.nthreads, kernels.SCRATCH_ROWS, kernels.padded_width(ny, size)), self.dtype),
+            tables=np.zeros((self.nthreads, 3, kernels.TABLE_SIZE), np.int64))
+
+    def allocate(self):
+        """Return a zeroed coefficient array of `coef_shape`."""
+        return _aligned(self.coef_shape, self.dtype)
+
+    def bands(self):
+        """Return the list of all :class:`Band`; Dirac is one band of level 0, orientation 'aa'."""
+        found = []
+        nx, ny = self.coef_shape[1:]
+        for b, length in enumerate(self._filters.lengths):
+            if not length:
+                found.append(Band(b, 0, "aa", (b, slice(0, self.shape[0]), slice(0, self.shape[1]))))
+                continue
+            for level in range(1, self.levels + 1):
+                mx, my = nx >> level, ny >> level
+                for o, orientation in enumerate(ORIENTATIONS):
+                    if o or level == self.levels:
+                        i, j = divmod(o, 2)
+                        where = (b, slice(i * mx, (i + 1) * mx), slice(j * my, (j + 1) * my))
+                        found.append(Band(b, level, orientation, where))
+        return found
+
+    def analysis(self, image, out=None):
+        """Return Ψ† image, of `coef_shape`, in `out` where given."""
+        out = self.allocate() if out is None else self._checked(out, "out", self.coef_shape)
+        self._analyse(image, kernels.Target(out, out, self._params, kernels.KEEP))
+        return out
+
+    def synthesis(self, coefs, out=None):
+        """Return the image Ψ coefs, in `out` where given."""
+        coefs = self._checked(coefs, "coefs", self.coef_shape)
+        out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
+        self._deeper(kernels.Target(coefs, coefs, self._params, kernels.KEEP), forth=False, back=True)
+        self._synthesise(coefs, out)
+        return out
+
+    def dual_step(self, model_bar, dual, threshold, weights=None, out=None):
+        """Update the dual variable of the prior in place and return Ψ dual.
+
+        dual ← clip(dual + Ψ† model_bar, ± threshold·weights), the proximal operator of the conjugate of
+        threshold·‖weights · ‖₁; Moreau: u − soft(u, threshold·weights).
+
+        Parameters
+        ----------
+        model_bar : (nx, ny)
+            Extrapolated model image.
+        dual : coef_shape
+            Updated in place.
+        threshold : float or (n_bases,)
+            κ, one number or one per basis.
+        weights : coef_shape, optional
+            W; ones when None.
+        out : (nx, ny), optional
+            Receives Ψ dual.
+        """
+        dual = self._checked(dual, "dual", self.coef_shape)
+        out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
+        self._params[:] = np.reshape(threshold, (-1, 1, 1))
+        if weights is None:
+            weights, mode = dual, kernels.CLIP
+        else:
+            weights, mode = self._checked(weights, "weights", self.coef_shape), kernels.CLIP_WEIGHTED
+        self._analyse(model_bar, kernels.Target(dual, weights, self._params, mode), back=True)
+        self._synthesise(dual, out)
+        return out
+
+    def reweight(self, image, alpha, out):
+        """Fill `out` with the weights α/(α + |Ψ† image|), α > 0 per band in the order of `bands`."""
+        out = self._checked(out, "out", self.coef_shape)
+        bands = self.bands()
+        alpha = np.broadcast_to(alpha, len(bands))
+        if not np.all(alpha > 0):
+            raise ValueError("alpha must be positive in every band")
+        for band, value in zip(bands, alpha):
+            self._params[band.basis, max(band.level, 1) - 1, ORIENTATIONS.index(band.orientation)] = value
+        self._analyse(image, kernels.Target(out, out, self._params, kernels.REWEIGHT))
+        return out
+
+    def _checked(self, array, name, shape):
+        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != self.dtype \
+                or not array.flags.c_contiguous:
+            raise ValueError(f"{name} must be a C-contiguous {self.dtype} array of shape {shape}")
+        return array
+
+    def _analyse(self, image, target, back=False):
+        image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
+        self._run(kernels.analyse_finest, image, self._filters, target, self._work)
+        self._deeper(target, forth=True, back=back)
+
+    def _deeper(self, target, forth, back):
+        if self.levels > 1:
+            self._run(kernels.transform_deeper, self._filters, target, self._work, self._owner, forth, back)
+
+    def _synthesise(self, coefs, out):
+        self._run(kernels.synthesise_finest, coefs, self.levels, self._filters, self._work, out)
+
+    def _run(self, kernel, *args):
+        """Run one stage on all threads and wait for it."""
+        others = [self._pool.submit(kernel, *args, worker, self.nthreads) for worker in range(1, self.nthreads)]
+        kernel(*args, 0, self.nthreads)
+        for other in others:
+            other.result()
+
+
+def _aligned(shape, dtype):
+    """Zeros that begin on a cache line, on huge pages where the system offers them (np.zeros gives neither)."""
+    size = int(np.prod(shape))
+    buffer = np.empty(size + CACHE_LINE // dtype.itemsize, dtype)
+    begin = -buffer.ctypes.data % CACHE_LINE // dtype.itemsize
+    array = buffer[begin:begin + size].reshape(shape)
+    array.fill(0)
+    return array
+
+
+def _filters(wavelets, dtype):
+    """Lay the taps out as the kernels read them."""
+    gain = 1 / np.sqrt(len(wavelets))
+    lengths = np.array([0 if name == "dirac" else pywt.Wavelet(name).dec_len for name in wavelets])
+    analysis = np.zeros((2, len(wavelets), 2, kernels.MAX_TAPS))
+    synthesis = np.zeros_like(analysis)
+    for b, (name, length) in enumerate(zip(wavelets, lengths)):
+        if length:
+            wavelet = pywt.Wavelet(name)
+            taps = np.array([wavelet.dec_lo[::-1], wavelet.dec_hi[::-1]])
+            analysis[0, b, :, :length] = taps
+            odd = length // 2 % 2  # even pixels meet the even taps, and the odd the odd
+            even_pixels, odd_pixels = taps[:, 1 - odd::2], taps[:, odd::2]
+            synthesis[0, b, 0, :length] = even_pixels[:, ::-1].T.ravel()
+            synthesis[0, b, 1, :length] = odd_pixels[:, ::-1].T.ravel()
+    analysis[1], synthesis[1] = gain * analysis[0], gain * synthesis[0]
+    return kernels.Filters(lengths, analysis.astype(dtype), synthesis.astype(dtype), dtype.type(gain))
+
+
+def _shares(costs, workers):
+    """Give every task to the worker with the least to do, the costly ones first."""
+    owner, load = np.zeros(len(costs), np.int64), np.zeros(workers)
+    for task in np.argsort(-costs, kind="stable"):
+        owner[task] = np.argmin(load)
+        load[owner[task]] += costs[task]
+    return owner

@@ -1,0 +1,32 @@
+"""What every task does around its implementation, as the tasks of casatasks do it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from casa_sara.private.validation import Parameter, validate
+
+__all__ = ["run_task"]
+
+
+def run_task(
+    name: str, parameters: tuple[Parameter, ...], implementation: Callable[..., Any], values: dict[str, Any]
+) -> Any:
+    """Validate `values`, run `implementation` with them and return its result.
+
+    Beginning, parameters, end and any error are logged. Errors, those of the validation among
+    them, are raised.
+    """
+    from casatasks.private.task_logging import end_log, except_log, start_log
+
+    state = start_log(name, [f"{key}={value!r}" for key, value in values.items()])
+    result = None
+    try:
+        result = implementation(**validate(parameters, values))
+    except Exception as error:
+        except_log(name, error)
+        raise
+    finally:
+        end_log(state, name, result)
+    return result

@@ -1,0 +1,143 @@
+"""From whitened visibilities to a model image: operators, bounds and solver put together, without CASA."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.operators.dictionary import SaraDictionary
+from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.operators.norms import power_method
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
+from casa_sara.solver.nnls import nnls
+from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
+from casa_sara.solver.reweighting import STEP_BALANCE, Schedule, solve
+
+__all__ = ["Reconstruction", "reconstruct"]
+
+NOISE_ONLY_SNR = 5.0
+DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
+
+
+@dataclass
+class Reconstruction:
+    """A solved image.
+
+    Attributes
+    ----------
+    model : float32 (nx, ny)
+        Jy/pixel.
+    l2_bounds, residual_norms : float (d,)
+        ε_j and μ_j, whitened.
+    nnls_bounds : float (d,) or None
+        First guess of the bounds, where they adapt.
+    record : SolverRecord
+    data_norm_sq : float
+        ‖U^½Φ‖², whitened.
+    threshold : float
+        Last κ, Jy/pixel.
+    noise_jy_per_beam : float
+        Noise of the naturally weighted dirty image for the noise levels found.
+    """
+
+    model: np.ndarray
+    l2_bounds: np.ndarray
+    residual_norms: np.ndarray
+    nnls_bounds: np.ndarray | None
+    record: SolverRecord
+    data_norm_sq: float
+    threshold: float
+    noise_jy_per_beam: float
+
+
+def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=None,
+                progress=lambda ppd, record: None, stopped=lambda: False):
+    """Find the SARA image of block-sorted visibilities.
+
+    Parameters
+    ----------
+    data : Visibilities
+        `vis` (Jy), `weight` (inverse variance) and `uvw` are used.
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    density : real (M,)
+        Sampling density of each sample; U = 1/density is the preconditioner.
+    grid : ImageGrid
+    options : SolverOptions
+    noise : float (d,), optional
+        Noise of each block measured from the data, in units of what the weights say; NaN where unknown.
+    startmodel : real (nx, ny), optional
+        First image, Jy/pixel.
+    progress, stopped : callable
+        See :func:`casa_sara.solver.reweighting.solve`.
+
+    Returns
+    -------
+    Reconstruction
+    """
+    sqrt_weight = np.sqrt(data.weight)
+    vis = data.vis * sqrt_weight
+    measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight,
+                                      nthreads=options.nthreads)
+    dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
+    precond = _preconditioner(density, options.precondition)
+    data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),
+                                grid.shape, dtype=np.float32)
+
+    ppd = AdaptivePPD(measurement, dictionary, vis, offsets, precond, data_norm_sq, options.positivity)
+    samples = np.diff(offsets)
+    weight_sums = np.add.reduceat(data.weight.astype(float), offsets[:-1])
+    bounds = _bounds(ppd, samples, weight_sums, noise, options)
+    noise_only = _is_noise_only(ppd, bounds, weight_sums)
+    ppd.rescale(STEP_BALANCE * _brightness(ppd, startmodel))
+    if startmodel is not None:
+        ppd.start_from(startmodel)
+
+    schedule = Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,
+                        options.reltol, options.finalreltol)
+    first_bounds = bounds.l2_bounds.copy()
+    record = solve(ppd, bounds, weight_sums, schedule, progress, stopped)
+    if record.stop_code == CONVERGED and noise_only:
+        record.stop_code = NOISE_ONLY
+    return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms,
+                          first_bounds if options.databound == "adapt" else None, record, data_norm_sq,
+                          ppd.threshold, float(np.sum(weight_sums * bounds.noise_weights) ** -0.5))
+
+
+def _preconditioner(density, wanted):
+    """U = 1/density, largest value 1."""
+    if not wanted:
+        return np.ones(density.size, np.float32)
+    precond = 1.0 / np.asarray(density, float)
+    return (precond / precond.max()).astype(np.float32)
+
+
+def _bounds(ppd, samples, weight_sums, noise, options):
+    if options.databound == "weights":
+        return GivenBounds(chi_square_bounds(samples))
+    if options.databound == "fixed":
+        return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)))
+    # the bounds start where positivity alone leaves the residual, never below the noise that the data show
+    _, residual = nnls(ppd.measurement, ppd.vis, ppd.precond, 1 / ppd.l2_step, positivity=options.positivity)
+    first = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
+    floor = ppd.residual_norms / DYNAMIC_RANGE
+    if noise is not None:
+        floor = np.fmax(floor, np.asarray(noise) * np.sqrt(2.0 * samples))
+    return AdaptiveBounds(first, samples, weight_sums, ppd.dictionary.n_bases, floor, options.regscale,
+                          options.boundrelchange, options.boundtol, options.boundstep, options.boundinterval)
+
+
+def _is_noise_only(ppd, bounds, weight_sums):
+    """Whether the naturally weighted dirty image holds no peak above 5 times its noise."""
+    whitening = np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(np.float32)
+    dirty = ppd.measurement.adjoint(ppd.vis * whitening)
+    return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(np.sum(weight_sums * bounds.noise_weights)))
+
+
+def _brightness(ppd, startmodel):
+    """The brightest pixel to expect, Jy/pixel: of the start model, or of one preconditioned gradient step."""
+    if startmodel is not None and np.abs(startmodel).max() > 0:
+        return float(np.abs(startmodel).max())
+    return float(np.abs(ppd.measurement.adjoint(ppd.precond * ppd.vis)).max() * ppd.l2_step)

@@ -1,0 +1,132 @@
+"""Algorithm 1 of Dabbech et al. 2018: the adaptive preconditioned primal-dual iteration."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casa_sara.solver import _kernels as kernels
+from casa_sara.solver.prox import ellipsoid_multiplier
+
+__all__ = ["AdaptivePPD"]
+
+
+class AdaptivePPD:
+    """The iteration that minimises ‖WΨ†x‖₁ over x ≥ 0 subject to the data.
+
+    One call of :meth:`step` is one pass through Algorithm 1 (step numbers of the paper):
+
+    ====  ==========================================================================
+    5     v_j ← U_j(1 − U_j^{−½} P_{E_j} )(U_j⁻¹v_j + Φ_j x̄) = λ_j (z_j − y_j)
+    6     μ_j = ‖y_j − Φ_j x‖
+    13    u ← (1 − S_{κW})(u + Ψ†x̄) = clip(u + Ψ†x̄, ±κW)
+    17    x ← P_{R+}(x − τ(η Φ†v + ζ Ψu)),  ζ = 1/‖Ψ‖² = 1
+    18    x̄ ← 2x − x_prev
+    19    σ = ‖x − x_prev‖ / ‖x‖
+    ====  ==========================================================================
+
+    The projection onto the ellipsoid of block j is z_j − y_j = U(s_j − y_j)/(U + λ_j).  Either its radius, the
+    bound ε_j, is given and the multiplier λ_j follows from ‖z_j − y_j‖ = ε_j (:attr:`l2_bounds`), or the
+    multiplier is given (:attr:`multipliers`) and the bound is the radius that belongs to it: see
+    :mod:`casa_sara.solver.l2_bounds` for how a noise level fixes a multiplier.
+
+    Parameters
+    ----------
+    measurement : object
+        `forward(image, out)` → whitened visibilities (M,), `adjoint(vis, out)` → real image; `shape`.
+    dictionary : object
+        `allocate()`, `dual_step(model_bar, dual, threshold, weights, out)` with ‖Ψ‖ = 1.
+    vis : complex (M,)
+        Whitened visibilities y, one block after the other.
+    offsets : int (d + 1,)
+        Block j is vis[offsets[j]:offsets[j+1]].
+    precond : real (M,)
+        U > 0.
+    data_norm_sq : float
+        ‖U^½Φ‖², or anything larger.
+    positivity : bool
+        x ≥ 0, or only real.
+
+    Attributes
+    ----------
+    model, model_bar : real (nx, ny)
+        x and x̄, Jy/pixel.
+    l1_dual, l2_dual
+        u and v.
+    l1_weights
+        W, or None for ones.
+    threshold : float
+        κ in Jy/pixel: only the speed depends on it, but see :meth:`rescale`.
+    residual_norms : float (d,)
+        μ_j of the model before the last step.
+    rel_change : float
+        σ.
+    """
+
+    def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True):
+        self.measurement, self.dictionary = measurement, dictionary
+        self.vis, self.precond, self.offsets = vis, precond, np.asarray(offsets)
+        self.positivity = positivity
+        self.tau, self.l2_step = 0.495, 1.0 / data_norm_sq
+        dtype = vis.real.dtype
+        self.model = np.zeros(measurement.shape, dtype)
+        self.model_bar = np.zeros_like(self.model)
+        self._data_gradient, self._prior_gradient = np.zeros_like(self.model), np.zeros_like(self.model)
+        self.l2_dual, self._phi_bar, self._phi_model = (np.zeros_like(vis) for _ in range(3))
+        self.l1_dual, self.l1_weights = dictionary.allocate(), None
+        self.threshold = 0.0
+        self.multipliers = np.zeros(self.n_blocks)
+        self.l2_bounds = None
+        self.residual_norms = np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()])
+        self.rel_change = np.inf
+        self.iteration = 0
+
+    @property
+    def n_blocks(self):
+        """Number of data blocks d."""
+        return len(self.offsets) - 1
+
+    def blocks(self):
+        """Yield (start, stop) of every block."""
+        return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
+
+    def start_from(self, model):
+        """Set x and x̄ to `model` (Jy/pixel); the dual variables stay."""
+        self.model[...] = model
+        self.model_bar[...] = model
+        self.measurement.forward(self.model, self._phi_model)
+
+    def step(self):
+        """Do one iteration."""
+        # Steps 5–6: data
+        self.measurement.forward(self.model_bar, self._phi_bar)
+        for j, (start, stop) in enumerate(self.blocks()):
+            self._data_step(j, start, stop)
+        self.measurement.adjoint(self.l2_dual, self._data_gradient)
+        # Step 13: prior
+        self.dictionary.dual_step(self.model_bar, self.l1_dual, self.threshold, self.l1_weights, self._prior_gradient)
+        # Steps 17–19: image
+        dtype = self.model.dtype.type
+        change, norm = kernels.primal_step(self.model, self.model_bar, self._data_gradient, self._prior_gradient,
+                                           dtype(self.tau), dtype(self.l2_step), self.positivity)
+        self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else (0.0 if change == 0 else np.inf)
+        self.iteration += 1
+
+    def _data_step(self, j, start, stop):
+        args = self.l2_dual, self._phi_bar, self.vis, self.precond
+        self.residual_norms[j] = np.sqrt(
+            kernels.residual_norm_sq(self.vis, self._phi_bar, self._phi_model, start, stop))
+        if self.l2_bounds is not None:
+            self.multipliers[j] = ellipsoid_multiplier(*args, self.l2_bounds[j], self.multipliers[j], start, stop)
+        kernels.update_dual(*args, self.precond.dtype.type(self.multipliers[j]), start, stop)
+
+    def rescale(self, threshold):
+        """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.
+
+        The saddle point of (κ, λ, u, v) and that of the same times a factor have the same image x.
+        """
+        if self.threshold > 0:
+            factor = threshold / self.threshold
+            self.l1_dual *= self.l1_dual.dtype.type(factor)
+            self.l2_dual *= self.precond.dtype.type(factor)
+            self.multipliers *= factor
+        self.threshold = float(threshold)

@@ -1,0 +1,145 @@
+"""The ℓ2 bounds of the data blocks: given, or adapted while the image is made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+__all__ = ["AdaptiveBounds", "GivenBounds", "chi_square_bounds"]
+
+
+def chi_square_bounds(samples, noise=1.0):
+    """Bounds ε_j that hold the noise of each block with a margin of two standard deviations.
+
+    A whitened complex sample has unit variance in its real and in its imaginary part when WEIGHT = 1/σ², so
+    ‖n_j‖² is χ² with 2M_j degrees of freedom: ε_j² = noise_j²·(2M_j + 2√(4M_j)).
+
+    Parameters
+    ----------
+    samples : int (d,)
+        M_j, complex samples of each block.
+    noise : float or float (d,)
+        Standard deviation of the whitened real parts: 1 when the weights are right.
+
+    Returns
+    -------
+    float64 (d,)
+    """
+    degrees = 2.0 * np.asarray(samples, float)
+    return np.asarray(noise) * np.sqrt(degrees + 2 * np.sqrt(2 * degrees))
+
+
+class GivenBounds:
+    """Bounds that stay as they are: hard constraints ‖y_j − Φ_j x‖ ≤ ε_j."""
+
+    def __init__(self, l2_bounds):
+        self.l2_bounds = np.asarray(l2_bounds, float)
+
+    @property
+    def noise_weights(self):
+        """Relative weight 1/σ_j² of the blocks, here equal."""
+        return np.ones_like(self.l2_bounds)
+
+    def apply_to(self, ppd):
+        """Hand the bounds to the iteration."""
+        ppd.l2_bounds = self.l2_bounds
+
+    def adapt(self, ppd):
+        """Nothing adapts; return False."""
+        return False
+
+    def met_by(self, ppd):
+        """Whether every block's residual is inside its bound, but for a relative 1e-3."""
+        return bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3)))
+
+
+@dataclass
+class AdaptiveBounds:
+    """Bounds that follow the residual of each block (Algorithm 1, Steps 6–10) and set its multiplier.
+
+    A bound is a noise level, ε_j = σ_j √(2M_j), σ_j in units of what the weights say, thermal noise and
+    calibration errors together.  It moves as in the paper: when the model has settled (σ < γ1), at least P
+    iterations after the last move, and when the residual differs by more than γ2, by the fraction γ3 of the
+    way to the residual norm μ_j.  It never falls below `floor`, the noise measured from the data themselves.
+
+    The level fixes the Lagrange multiplier of the block's ellipsoid, instead of the ellipsoid's radius: the
+    image minimises
+
+        κ_g ‖WΨ†x‖₁ + ½ Σ_j ‖y_j − Φ_j x‖²/σ_j²,     κ_g = regscale · √(Σ_j σ_j⁻² Σ_{m∈j} w_m) / √b,
+
+    where κ_g is the noise of one Dirac coefficient of the gradient Φ†n (w the whitening weights, b bases), so
+    that regscale = 1 thresholds at the noise.  In Algorithm 1, whose κ is free, that is λ_j = κ/(η κ_g σ_j²).
+    A radius would have to be right to a fraction 1/√(2M_j) to mean anything; a multiplier need not.
+
+    Parameters
+    ----------
+    l2_bounds : float (d,)
+        First guess, e.g. of NNLS.
+    samples : int (d,)
+        M_j.
+    weight_sums : float (d,)
+        Σ w over the block, 1/Jy².
+    n_bases : int
+    floor : float (d,)
+        Lowest bounds allowed.
+    rel_change, tol, step, min_interval
+        γ1, γ2, γ3, P.
+    """
+
+    l2_bounds: np.ndarray
+    samples: np.ndarray
+    weight_sums: np.ndarray
+    n_bases: int
+    floor: np.ndarray
+    regscale: float = 1.0
+    rel_change: float = 1e-2
+    tol: float = 1e-2
+    step: float = 0.618
+    min_interval: int = 20
+    _last_move: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
+        self._last_move = np.zeros(len(self.l2_bounds), int)
+
+    @property
+    def noise(self):
+        """σ_j: noise level in units of what the weights say, (d,)."""
+        return self.l2_bounds / np.sqrt(2.0 * self.samples)
+
+    @property
+    def noise_weights(self):
+        """1/σ_j², (d,)."""
+        return self.noise**-2.0
+
+    @property
+    def gradient_noise(self):
+        """κ_g, in 1/Jy."""
+        return self.regscale * np.sqrt(np.sum(self.weight_sums * self.noise_weights) / self.n_bases)
+
+    def apply_to(self, ppd):
+        """Hand the multipliers to the iteration, for its current κ."""
+        ppd.l2_bounds = None
+        ppd.multipliers[:] = ppd.threshold / (ppd.l2_step * self.gradient_noise) * self.noise_weights
+
+    def adapt(self, ppd):
+        """Steps 7–10; return whether any bound moved."""
+        if ppd.rel_change >= self.rel_change:
+            return False
+        move = (ppd.iteration - self._last_move >= self.min_interval) & self._off_target(ppd)
+        if not move.any():
+            return False
+        target = np.maximum(ppd.residual_norms, self.floor)
+        self.l2_bounds = np.where(move, self.step * target + (1 - self.step) * self.l2_bounds, self.l2_bounds)
+        self._last_move[move] = ppd.iteration
+        self.apply_to(ppd)
+        return True
+
+    def met_by(self, ppd):
+        """Whether no bound has further to go: every block's residual agrees with its bound."""
+        return not np.any(self._off_target(ppd))
+
+    def _off_target(self, ppd):
+        """Condition (iii): blocks whose residual norm, or floor, is further than γ2 from the bound."""
+        return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > self.tol * self.l2_bounds

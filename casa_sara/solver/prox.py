@@ -1,0 +1,77 @@
+"""Projection onto the data ellipsoids of Algorithm 1, Step 5."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casa_sara.solver import _kernels as kernels
+
+__all__ = ["ellipsoid_multiplier", "project_ellipsoid"]
+
+
+def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, start=0, stop=None, tol=1e-10):
+    """Lagrange multiplier of the projection onto one data ellipsoid.
+
+    The projection of s = U⁻¹v + Φx̄ in the metric U onto {z : ‖z − y‖ ≤ ε} is
+
+        z − y = U(s − y)/(U + λ),   with λ ≥ 0 the root of ‖z − y‖ = ε,
+
+    and λ = 0 where s lies inside.  1/‖z − y‖ is concave and increasing in λ, nearly a straight line, so
+    Newton's iteration on 1/‖z − y‖ − 1/ε converges from any start in a few steps.
+
+    Parameters
+    ----------
+    dual, phi_bar, vis : complex (M,)
+        v, Φx̄ and y, whitened.
+    precond : real (M,)
+        U > 0.
+    bound : float
+        ε > 0 in whitened units.
+    multiplier : float
+        First guess, e.g. that of the iteration before.
+    start, stop : int
+        The block is samples start … stop − 1.
+
+    Returns
+    -------
+    float
+        λ.
+
+    Raises
+    ------
+    RuntimeError
+        When the iteration does not settle, which only non-finite data can cause.
+    """
+    stop = vis.size if stop is None else stop
+    norm_sq, _ = kernels.shifted_norms(dual, phi_bar, vis, precond, 0.0, start, stop)
+    if norm_sq <= bound * bound:
+        return 0.0
+    value = float(multiplier)
+    for _ in range(100):
+        norm_sq, slope = kernels.shifted_norms(dual, phi_bar, vis, precond, value, start, stop)
+        norm = np.sqrt(norm_sq)
+        # Newton on 1/n − 1/ε, whose derivative is −n'/n² = slope/n³
+        new = max(value + (1 / bound - 1 / norm) * norm**3 / slope, 0.0)
+        if abs(new - value) <= tol * new:
+            return new
+        value = new
+    raise RuntimeError("the projection onto a data ellipsoid did not converge: are the visibilities finite?")
+
+
+def project_ellipsoid(point, centre, precond, bound):
+    """Projection of `point` in the metric U onto the ball {z : ‖z − centre‖ ≤ bound}.
+
+    Parameters
+    ----------
+    point, centre : complex (M,)
+    precond : real (M,)
+        U > 0.
+    bound : float
+
+    Returns
+    -------
+    complex (M,)
+    """
+    zero = np.zeros_like(centre)
+    multiplier = ellipsoid_multiplier(zero, point, centre, precond, bound)
+    return centre + (point - centre) * (precond / (precond + multiplier))

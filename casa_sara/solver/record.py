@@ -1,0 +1,67 @@
+"""What happened during a solution, kept for the log, the return dictionary and the plots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+__all__ = ["CONVERGED", "DIVERGED", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER", "SolverRecord",
+           "STOP_DESCRIPTIONS"]
+
+CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, DIVERGED = 101, 102, 103, 104, 105
+STOP_DESCRIPTIONS = {
+    CONVERGED: "converged",
+    ITERATION_LIMIT: "iteration limit",
+    NOISE_ONLY: "noise only",
+    STOPPED_BY_USER: "stopped by user",
+    DIVERGED: "diverged",
+}
+
+
+@dataclass
+class SolverRecord:
+    """History of one solution; every list has one entry per row of `iteration`.
+
+    Attributes
+    ----------
+    iteration : list of int
+    reweighting : list of int
+        How many times the weights had been updated.
+    rel_change : list of float
+        ‖x − x_prev‖/‖x‖ of the iteration.
+    residual_norm : list of float
+        ‖y − Φx‖ over all blocks, whitened.
+    model_flux, model_max : list of float
+        Jy and Jy/pixel.
+    bounds : list of (int, float (d,))
+        Iteration and ε_j, at the start and whenever they moved.
+    reweightings : list of dict
+        Iteration, scale of the weights and relative change of the model since the one before.
+    stop_code : int
+        One of the codes of this module.
+    """
+
+    iteration: list[int] = field(default_factory=list)
+    reweighting: list[int] = field(default_factory=list)
+    rel_change: list[float] = field(default_factory=list)
+    residual_norm: list[float] = field(default_factory=list)
+    model_flux: list[float] = field(default_factory=list)
+    model_max: list[float] = field(default_factory=list)
+    bounds: list[tuple[int, np.ndarray]] = field(default_factory=list)
+    reweightings: list[dict] = field(default_factory=list)
+    stop_code: int = 0
+
+    @property
+    def stop_description(self) -> str:
+        """The stop code in words."""
+        return STOP_DESCRIPTIONS.get(self.stop_code, "not finished")
+
+    def note(self, ppd, reweighting: int) -> None:
+        """Add the state of the iteration `ppd`."""
+        self.iteration.append(ppd.iteration)
+        self.reweighting.append(reweighting)
+        self.rel_change.append(ppd.rel_change)
+        self.residual_norm.append(float(np.linalg.norm(ppd.residual_norms)))
+        self.model_flux.append(float(ppd.model.sum(dtype=float)))
+        self.model_max.append(float(ppd.model.max()))

@@ -1,0 +1,158 @@
+"""Algorithm 2 of Dabbech et al. 2018: re-weighted ℓ1 problems, solved one after the other."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, SolverRecord
+
+__all__ = ["Schedule", "band_noise", "solve"]
+
+STEP_BALANCE = 0.01  # κ, in units of the brightest pixel
+FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When to re-weight and when to stop.
+
+    Attributes
+    ----------
+    niter : int
+        Most iterations in all.
+    nreweights : int
+        Most re-weightings.
+    reweight_decay : float
+        ω, factor on the scale of the weights.
+    reweight_tol : float
+        ϱ: two re-weighted solutions that differ by less end the re-weighting.
+    reltol, final_reltol : float
+        Relative change that ends one ℓ1 problem, and the last one.
+    interval : int
+        Most iterations of one ℓ1 problem before the last.
+    """
+
+    niter: int = 100_000
+    nreweights: int = 20
+    reweight_decay: float = 0.618
+    reweight_tol: float = 1e-2
+    reltol: float = 2e-4
+    final_reltol: float = 1e-4
+    interval: int = 30
+
+
+def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
+    """Standard deviation of the noise in every band of the dictionary, Jy/pixel.
+
+    One realisation of the noise, weighted by 1/σ_j² as the data are, is carried to the image and normalised by
+    the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
+    scratch space.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    noise_weights : float (d,)
+        1/σ_j².
+    weight_sums : float (d,)
+        Σ w of each block.
+
+    Returns
+    -------
+    float (number of bands,)
+        In the order of `dictionary.bands()`.
+    """
+    rng = np.random.default_rng(seed)
+    noise = np.empty_like(ppd.vis)
+    for j, (a, b) in enumerate(ppd.blocks()):
+        noise[a:b] = np.sqrt(noise_weights[j]) * (rng.standard_normal(b - a) + 1j * rng.standard_normal(b - a))
+    image = ppd.measurement.adjoint(noise)
+    image /= image.dtype.type(np.sum(weight_sums * noise_weights))
+    coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
+    return np.array([np.sqrt(np.mean(np.square(coefs[band.slice], dtype=float))) for band in ppd.dictionary.bands()])
+
+
+def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False):
+    """Algorithm 2: solve, re-weight, and solve again until nothing changes.
+
+    The weights of re-weighting k are W = α/(α + |Ψ†x|) with α = max(10 ω^{k−1}, 1.5) × the noise of the band,
+    where the paper has ω^k × the largest coefficient of the basis: docs/decisions.md, "Weights from the noise".
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+        The iteration, with its first κ (`threshold`) set.
+    bounds : GivenBounds or AdaptiveBounds
+    weight_sums : float (d,)
+        Σ w of each block, 1/Jy².
+    schedule : Schedule
+    progress : callable
+        Called after every iteration with (ppd, record).
+    stopped : callable
+        Asked after every iteration; True ends the solution with what there is.
+
+    Returns
+    -------
+    SolverRecord
+    """
+    record = SolverRecord()
+    bounds.apply_to(ppd)
+    record.bounds.append((0, bounds.l2_bounds.copy()))
+    previous = ppd.model.copy()
+    for k in range(schedule.nreweights + 1):
+        last = k == schedule.nreweights
+        record.stop_code = _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped)
+        if record.stop_code != CONVERGED:
+            break
+        change = _relative(ppd.model, previous)
+        if last:
+            break
+        scale = FIRST_SCALE * schedule.reweight_decay**k
+        if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd):
+            break
+        previous[...] = ppd.model
+        _reweight(ppd, bounds, weight_sums, max(scale, LAST_SCALE))
+        record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change))
+    if record.stop_code == DIVERGED:
+        ppd.model[...] = previous
+    return record
+
+
+def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
+    """Algorithm 1 for one set of weights; return its stop code."""
+    tolerance = schedule.final_reltol if last else schedule.reltol
+    start = ppd.iteration
+    while True:
+        ppd.step()
+        record.note(ppd, k)
+        if bounds.adapt(ppd):
+            record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))
+        progress(ppd, record)
+        if not np.isfinite(ppd.rel_change) or not np.isfinite(record.residual_norm[-1]):
+            return DIVERGED
+        if stopped():
+            return STOPPED_BY_USER
+        if ppd.iteration >= schedule.niter:
+            return ITERATION_LIMIT
+        done = ppd.iteration - start
+        if done > 1 and ppd.rel_change < tolerance and bounds.met_by(ppd):
+            return CONVERGED
+        if not last and done >= (2 if k == 0 else 1) * schedule.interval:
+            return CONVERGED
+
+
+def _reweight(ppd, bounds, weight_sums, scale):
+    if ppd.l1_weights is None:
+        ppd.l1_weights = ppd.dictionary.allocate()
+    alpha = scale * band_noise(ppd, bounds.noise_weights, weight_sums)
+    ppd.dictionary.reweight(ppd.model, np.maximum(alpha, 1e-30), ppd.l1_weights)
+    brightest = float(np.abs(ppd.model).max())
+    if brightest > 0:
+        ppd.rescale(STEP_BALANCE * brightest)
+        bounds.apply_to(ppd)
+
+
+def _relative(model, previous):
+    norm = np.linalg.norm(model)
+    return float(np.linalg.norm(model - previous) / norm) if norm > 0 else 0.0

@@ -1,0 +1,106 @@
+"""The dependency table of setup.cfg against the imports, and the house's rules on who imports what."""
+
+import ast
+import configparser
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+import casa_sara
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "casa_sara"
+MODULES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))
+
+DISTRIBUTIONS = {"pywt": "PyWavelets"}  # where it is not the name of the import
+NOT_IMPORTED = {
+    "casadata": "the data that CASA needs to be imported at all",
+    "six": "casatasks imports it and does not require it",
+}
+CASA = {"casatools", "casatasks"}
+
+# What each room may import beside itself and the standard library: other rooms and packages.
+ROOMS = {
+    "__init__": {"casa_sara.tasks"},
+    "tasks": {"casa_sara.private"},
+    "gotasks": {"casa_sara.private", "casa_sara.tasks"},
+    "private": {"casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.casa", "casashell", *CASA},
+    "options": set(),
+    "visibilities": {"numpy"},
+    "noise": {"casa_sara.visibilities", "numpy"},
+    "casa": {"casa_sara", "casa_sara.options", "casa_sara.visibilities", "numpy", *CASA},
+    "operators": {
+        "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
+    },
+    "solver": {"casa_sara.options", "numpy", "numba"},
+    "analysis": {"numpy", "scipy", "astropy", "matplotlib"},
+}
+LIBRARY = ("options", "visibilities", "noise", "operators", "solver", "analysis")
+ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
+NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
+ROOMS["imaging"] = {"casa_sara.casa", "numpy", *NUMERICS}
+ROOMS["demo"] = {"casa_sara", "casa_sara.casa", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS, *CASA}
+
+
+def imports(module):
+    """Return what a module of the package imports: rooms as casa_sara.<room>, other packages by their name."""
+    names = set()
+    for node in ast.walk(ast.parse((PACKAGE / module).read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module}: relative import"
+            rooms = {f"casa_sara.{alias.name}" for alias in node.names}
+            if node.module == "casa_sara" and rooms & {f"casa_sara.{name}" for name in ROOMS}:
+                names |= rooms
+            else:
+                names.add(node.module)
+    parts = [name.split(".") for name in names]
+    return {".".join(part[:2]) if part[0] == "casa_sara" else part[0] for part in parts} - sys.stdlib_module_names
+
+
+def room(module):
+    return module.split("/")[0].removesuffix(".py")
+
+
+def required(section, option):
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    return {re.match(r"[\w-]+", line)[0] for line in config[section][option].split("\n") if line.strip()}
+
+
+def test_dependency_table_is_what_is_imported():
+    imported = {DISTRIBUTIONS.get(name, name) for module in MODULES for name in imports(module)}
+    imported = {name for name in imported if not name.startswith("casa_sara")}
+    table = required("options", "install_requires")
+    missing = imported - table - required("options.extras_require", "shell")
+    idle = table - imported - NOT_IMPORTED.keys()
+    assert not missing and not idle, f"not in setup.cfg: {missing}; in setup.cfg and not imported: {idle}"
+
+
+@pytest.mark.parametrize("module", MODULES)
+def test_module_imports_what_its_room_may(module):
+    assert room(module) in ROOMS, "a new room: enter it in ROOMS"
+    assert imports(module) - {f"casa_sara.{room(module)}"} <= ROOMS[room(module)]
+
+
+def test_numerics_never_reach_casa():
+    """No chain of imports leads from the numerics to CASA."""
+    reached, new = set(), set(NUMERICS)
+    while new:
+        reached |= new
+        rooms = {name.removeprefix("casa_sara.") for name in new if name.startswith("casa_sara.")}
+        new = {name for module in MODULES if room(module) in rooms for name in imports(module)} - reached
+    assert not reached & (CASA | {"casashell", "casa_sara.casa", "casa_sara.private"})
+
+
+def test_changelog_tells_this_version():
+    assert f"## {casa_sara.__version__}" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_package_is_complete():
+    """Every folder with modules is a package, or installing the project would leave it out."""
+    for module in MODULES:
+        assert (PACKAGE / module).parent.joinpath("__init__.py").exists(), module

@@ -1,0 +1,207 @@
+"""Algorithms 1 and 2 on dense matrices, against minimisers found in other ways."""
+
+import numpy as np
+import pytest
+from dense_problem import Problem
+from scipy.optimize import minimize, nnls as scipy_nnls
+
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
+from casa_sara.solver.nnls import nnls
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
+from casa_sara.solver.reweighting import Schedule, solve
+
+
+def _ppd(problem, precond=None, threshold=0.2):
+    precond = problem.precond if precond is None else precond
+    ppd = AdaptivePPD(problem.measurement, problem.dictionary, problem.vis, problem.offsets, precond,
+                      problem.data_norm_sq(precond))
+    ppd.rescale(threshold)
+    return ppd
+
+
+def _slsqp_minimiser(problem, bounds):
+    """Minimise Σt over |Ψ†x| ≤ t, x ≥ 0 and the data balls with scipy's SLSQP."""
+    size, matrix = problem.truth.size, problem.dictionary.matrix
+    coefs = len(matrix)
+    linear = np.block([[matrix, np.eye(coefs)], [-matrix, np.eye(coefs)]])
+    blocks = list(zip(problem.offsets[:-1], problem.offsets[1:]))
+
+    def slack(z):
+        residual = problem.vis - problem.measurement.matrix @ z[:size]
+        return [bounds[j] ** 2 - np.sum(np.abs(residual[a:b]) ** 2) for j, (a, b) in enumerate(blocks)]
+
+    def slack_gradient(z):
+        rows = []
+        for a, b in blocks:
+            part = problem.measurement.matrix[a:b]
+            rows.append(np.concatenate([2 * (part.conj().T @ (problem.vis[a:b] - part @ z[:size])).real, np.zeros(coefs)]))
+        return np.array(rows)
+
+    start = np.concatenate([problem.truth.ravel(), np.abs(matrix @ problem.truth.ravel())])
+    gradient = np.concatenate([np.zeros(size), np.ones(coefs)])
+    result = minimize(
+        lambda z: z[size:].sum(), start, jac=lambda z: gradient, method="SLSQP",
+        bounds=[(0, None)] * size + [(None, None)] * coefs,
+        constraints=[{"type": "ineq", "fun": lambda z: linear @ z, "jac": lambda z: linear},
+                     {"type": "ineq", "fun": slack, "jac": slack_gradient}],
+        options={"ftol": 1e-13, "maxiter": 1000})
+    # at this tolerance its line search may end before its own test does
+    assert result.status in (0, 8) and np.min(slack(result.x)) > -1e-7, result.message
+    return result.x[:size].reshape(problem.shape)
+
+
+def _run(ppd, bounds, iterations):
+    bounds.apply_to(ppd)
+    for _ in range(iterations):
+        ppd.step()
+    return ppd.model
+
+
+def test_algorithm_1_reaches_the_constrained_minimiser_that_slsqp_finds():
+    problem = Problem(seed=3)
+    bounds = 1.05 * problem.errors
+    expected = _slsqp_minimiser(problem, bounds)
+    found = _run(_ppd(problem), GivenBounds(bounds), 20_000)
+    np.testing.assert_allclose(found, expected, atol=2e-5 * expected.max())
+    residual = problem.vis - problem.measurement.forward(found)
+    assert np.linalg.norm(residual[:9]) <= bounds[0] * (1 + 1e-6)
+
+
+@pytest.mark.parametrize("threshold", [0.05, 0.2])
+def test_neither_preconditioner_nor_threshold_moves_the_constrained_minimiser(threshold):
+    problem = Problem(seed=4)
+    bounds = 1.05 * problem.errors
+    with_precond = _run(_ppd(problem, threshold=threshold), GivenBounds(bounds), 30_000)
+    without = _run(_ppd(problem, np.ones_like(problem.precond)), GivenBounds(bounds), 200_000)
+    np.testing.assert_allclose(with_precond, without, atol=3e-4 * without.max())
+
+
+def test_given_noise_levels_the_iteration_reaches_the_penalised_minimiser():
+    problem = Problem(seed=5, noise=(1.0, 0.5))
+    samples = np.diff(problem.offsets)
+    weight_sums = np.array([20.0, 30.0])
+    bounds = AdaptiveBounds(np.array([1.0, 0.5]) * np.sqrt(2.0 * samples), samples, weight_sums, 3, np.zeros(2),
+                            rel_change=0.0)
+    found = _run(_ppd(problem), bounds, 20_000)
+    # the same cost by coordinates: x ≥ 0, t ≥ |Ψ†x|
+    matrix, size = problem.dictionary.matrix, problem.truth.size
+    sigma_sq = np.repeat(bounds.noise**2, samples)
+
+    def cost(z):
+        residual = problem.vis - problem.measurement.matrix @ z[:size]
+        value = bounds.gradient_noise * z[size:].sum() + 0.5 * np.sum(np.abs(residual) ** 2 / sigma_sq)
+        gradient = -(problem.measurement.matrix.conj().T @ (residual / sigma_sq)).real
+        return value, np.concatenate([gradient, np.full(len(matrix), bounds.gradient_noise)])
+
+    linear = np.block([[matrix, np.eye(len(matrix))], [-matrix, np.eye(len(matrix))]])
+    result = minimize(cost, np.concatenate([problem.truth.ravel(), np.abs(matrix @ problem.truth.ravel())]), jac=True,
+                      method="SLSQP", bounds=[(0, None)] * size + [(None, None)] * len(matrix),
+                      constraints=[{"type": "ineq", "fun": lambda z: linear @ z, "jac": lambda z: linear}],
+                      options={"ftol": 1e-14, "maxiter": 1000})
+    np.testing.assert_allclose(found, result.x[:size].reshape(problem.shape), atol=1e-4 * found.max())
+
+
+def test_residual_norms_are_those_of_the_model_before_the_step():
+    problem = Problem(seed=6)
+    ppd = _ppd(problem)
+    GivenBounds(problem.errors).apply_to(ppd)
+    for _ in range(5):
+        before = ppd.model.copy()
+        ppd.step()
+    residual = problem.vis - problem.measurement.forward(before)
+    expected = [np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()]
+    np.testing.assert_allclose(ppd.residual_norms, expected, rtol=1e-10)
+
+
+def test_rescaling_the_threshold_leaves_the_fixed_point():
+    problem = Problem(seed=7)
+    ppd = _ppd(problem)
+    converged = _run(ppd, GivenBounds(1.05 * problem.errors), 20_000).copy()
+    ppd.rescale(0.01)
+    for _ in range(20):
+        ppd.step()
+    np.testing.assert_allclose(ppd.model, converged, atol=1e-6 * converged.max())
+
+
+def test_bounds_adapt_by_the_papers_rule():
+    samples, sums = np.array([50, 50]), np.ones(2)
+    bounds = AdaptiveBounds(np.array([10.0, 10.0]), samples, sums, 9, np.array([0.0, 9.5]), rel_change=1e-3, tol=1e-2,
+                            step=0.5, min_interval=10)
+    problem = Problem(seed=8)
+    ppd = _ppd(problem)
+    ppd.residual_norms = np.array([20.0, 2.0])
+    ppd.rel_change, ppd.iteration = 1e-2, 50
+    assert not bounds.adapt(ppd)  # condition (i): the model still moves
+    ppd.rel_change = 1e-4
+    assert bounds.adapt(ppd)
+    np.testing.assert_allclose(bounds.l2_bounds, [15.0, 9.75])  # half way; the second towards its floor
+    ppd.iteration = 55
+    assert not bounds.adapt(ppd)  # condition (ii): too soon
+    ppd.iteration = 60
+    assert bounds.adapt(ppd)
+    np.testing.assert_allclose(bounds.l2_bounds, [17.5, 9.625])
+    ppd.residual_norms, ppd.iteration = bounds.l2_bounds * 1.005, 80
+    assert not bounds.adapt(ppd)  # condition (iii): within tolerance
+
+
+@pytest.mark.parametrize("start", [0.3, 1.0, 10.0])
+def test_noise_levels_are_found_from_any_start(start):
+    noise = np.array([0.4, 2.0])
+    problem = Problem(seed=9, shape=(4, 4), samples=(300, 300), noise=tuple(noise))
+    samples = np.diff(problem.offsets)
+    power = np.abs(problem.measurement.matrix[:, 0]) ** 2
+    sums = np.add.reduceat(power, problem.offsets[:-1])
+    bounds = AdaptiveBounds(start * np.sqrt(2.0 * samples), samples, sums, 3, np.zeros(2))
+    solve(_ppd(problem), bounds, sums, Schedule(nreweights=8))
+    np.testing.assert_allclose(bounds.noise, noise, rtol=0.1)
+
+
+def test_chi_square_bounds_hold_the_noise_of_unit_weights():
+    rng = np.random.default_rng(10)
+    norms = np.linalg.norm(rng.normal(size=(2000, 200)), axis=1)  # 100 complex samples
+    bound = chi_square_bounds([100])[0]
+    assert 0.955 < np.mean(norms < bound) < 0.995  # two standard deviations of χ²
+    assert chi_square_bounds([100], 2.0)[0] == pytest.approx(2 * bound)
+
+
+def test_nnls_reaches_scipys_solution():
+    problem = Problem(seed=11)
+    root = np.sqrt(problem.precond)
+    stacked = np.vstack([(root[:, None] * problem.measurement.matrix).real, (root[:, None] * problem.measurement.matrix).imag])
+    expected, _ = scipy_nnls(stacked, np.concatenate([(root * problem.vis).real, (root * problem.vis).imag]))
+    found, residual = nnls(problem.measurement, problem.vis, problem.precond, problem.data_norm_sq(problem.precond),
+                           tol=1e-12, max_iter=20_000)
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-8)
+    np.testing.assert_allclose(residual, problem.vis - problem.measurement.forward(found))
+
+
+def test_reweighting_sharpens_and_every_update_is_recorded():
+    problem = Problem(seed=12, shape=(8, 8), samples=(12, 14))  # 52 equations for 64 pixels
+    samples = np.diff(problem.offsets)
+    sums = np.add.reduceat(np.abs(problem.measurement.matrix[:, 0]) ** 2, problem.offsets[:-1])
+
+    def solution(nreweights):
+        bounds = AdaptiveBounds(problem.errors, samples, sums, 3, np.zeros(2))
+        ppd = _ppd(problem)
+        record = solve(ppd, bounds, sums, Schedule(nreweights=nreweights, reweight_tol=1e-4))
+        return ppd.model, record
+
+    plain, record = solution(0)
+    assert record.stop_code == CONVERGED and record.reweightings == []
+    sharp, record = solution(10)
+    error = [np.linalg.norm(model - problem.truth) for model in (plain, sharp)]
+    assert error[1] < 0.7 * error[0]
+    assert len(record.reweightings) == max(record.reweighting) > 5
+    scales = [update["scale"] for update in record.reweightings]
+    assert scales[0] == 10.0 and min(scales) == 1.5 and all(a >= b for a, b in zip(scales, scales[1:]))
+
+
+def test_iteration_limit_and_stop_request():
+    problem = Problem(seed=13)
+    sums = np.ones(2)
+    record = solve(_ppd(problem), GivenBounds(problem.errors), sums, Schedule(niter=7))
+    assert (record.stop_code, record.iteration[-1]) == (ITERATION_LIMIT, 7)
+    ppd = _ppd(problem)
+    record = solve(ppd, GivenBounds(problem.errors), sums, stopped=lambda: ppd.iteration == 4)
+    assert (record.stop_code, record.iteration[-1]) == (STOPPED_BY_USER, 4)
