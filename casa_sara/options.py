@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["Selection", "ImageGrid", "Weighting", "SolverOptions"]
+__all__ = ["ImageGrid", "Output", "Selection", "SolverOptions", "Weighting"]
 
 SARA_BASES = ("dirac", "db1", "db2", "db3", "db4", "db5", "db6", "db7", "db8")
 
@@ -85,3 +85,18 @@ class SolverOptions:
     finalreltol: float = 1e-4
     regscale: float = 1.0
     nthreads: int = 1
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where results go, and what goes along.
+
+    `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image.
+    """
+
+    imagename: str
+    startmodel: str = ""
+    blocks: int = 0
+    restoringbeam: tuple[str, ...] | None = ()
+    savemodel: str = "none"
+    history: tuple[str, ...] = ()

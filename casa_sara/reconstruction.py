@@ -13,10 +13,11 @@ from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.nnls import nnls
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
-from casa_sara.solver.reweighting import STEP_BALANCE, Schedule, solve
+from casa_sara.solver.reweighting import Schedule, solve
 
-__all__ = ["Reconstruction", "reconstruct"]
+__all__ = ["Reconstruction", "reconstruct", "schedule_of"]
 
+STEP_BALANCE = 0.05  # κ in units of the mean brightness Σx²/Σx of the NNLS image
 NOISE_ONLY_SNR = 5.0
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
@@ -31,8 +32,8 @@ class Reconstruction:
         Jy/pixel.
     l2_bounds, residual_norms : float (d,)
         ε_j and μ_j, whitened.
-    nnls_bounds : float (d,) or None
-        First guess of the bounds, where they adapt.
+    nnls_norms : float (d,)
+        μ_j of the NNLS image, from which adaptive bounds start.
     record : SolverRecord
     data_norm_sq : float
         ‖U^½Φ‖², whitened.
@@ -45,7 +46,7 @@ class Reconstruction:
     model: np.ndarray
     l2_bounds: np.ndarray
     residual_norms: np.ndarray
-    nnls_bounds: np.ndarray | None
+    nnls_norms: np.ndarray
     record: SolverRecord
     data_norm_sq: float
     threshold: float
@@ -89,21 +90,27 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     ppd = AdaptivePPD(measurement, dictionary, vis, offsets, precond, data_norm_sq, options.positivity)
     samples = np.diff(offsets)
     weight_sums = np.add.reduceat(data.weight.astype(float), offsets[:-1])
-    bounds = _bounds(ppd, samples, weight_sums, noise, options)
+    # positivity alone: where the bounds start, and how bright the image is
+    nnls_model, nnls_residual = nnls(measurement, vis, precond, data_norm_sq, positivity=options.positivity)
+    nnls_norms = np.array([np.linalg.norm(nnls_residual[a:b]) for a, b in ppd.blocks()])
+    bounds = _bounds(ppd, nnls_norms, samples, weight_sums, noise, options)
     noise_only = _is_noise_only(ppd, bounds, weight_sums)
-    ppd.rescale(STEP_BALANCE * _brightness(ppd, startmodel))
+    ppd.rescale(STEP_BALANCE * _mean_brightness(nnls_model if startmodel is None else startmodel))
     if startmodel is not None:
         ppd.start_from(startmodel)
 
-    schedule = Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,
-                        options.reltol, options.finalreltol)
-    first_bounds = bounds.l2_bounds.copy()
-    record = solve(ppd, bounds, weight_sums, schedule, progress, stopped)
+    record = solve(ppd, bounds, weight_sums, schedule_of(options), progress, stopped)
     if record.stop_code == CONVERGED and noise_only:
         record.stop_code = NOISE_ONLY
     return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms,
-                          first_bounds if options.databound == "adapt" else None, record, data_norm_sq,
+                          nnls_norms, record, data_norm_sq,
                           ppd.threshold, float(np.sum(weight_sums * bounds.noise_weights) ** -0.5))
+
+
+def schedule_of(options):
+    """The solver's schedule for these task parameters."""
+    return Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,
+                    options.reltol, options.finalreltol)
 
 
 def _preconditioner(density, wanted):
@@ -114,18 +121,16 @@ def _preconditioner(density, wanted):
     return (precond / precond.max()).astype(np.float32)
 
 
-def _bounds(ppd, samples, weight_sums, noise, options):
+def _bounds(ppd, nnls_norms, samples, weight_sums, noise, options):
     if options.databound == "weights":
         return GivenBounds(chi_square_bounds(samples))
     if options.databound == "fixed":
         return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)))
-    # the bounds start where positivity alone leaves the residual, never below the noise that the data show
-    _, residual = nnls(ppd.measurement, ppd.vis, ppd.precond, 1 / ppd.l2_step, positivity=options.positivity)
-    first = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
+    # never below the noise that the data show
     floor = ppd.residual_norms / DYNAMIC_RANGE
     if noise is not None:
         floor = np.fmax(floor, np.asarray(noise) * np.sqrt(2.0 * samples))
-    return AdaptiveBounds(first, samples, weight_sums, ppd.dictionary.n_bases, floor, options.regscale,
+    return AdaptiveBounds(nnls_norms, samples, weight_sums, ppd.dictionary.n_bases, floor, options.regscale,
                           options.boundrelchange, options.boundtol, options.boundstep, options.boundinterval)
 
 
@@ -136,8 +141,7 @@ def _is_noise_only(ppd, bounds, weight_sums):
     return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(np.sum(weight_sums * bounds.noise_weights)))
 
 
-def _brightness(ppd, startmodel):
-    """The brightest pixel to expect, Jy/pixel: of the start model, or of one preconditioned gradient step."""
-    if startmodel is not None and np.abs(startmodel).max() > 0:
-        return float(np.abs(startmodel).max())
-    return float(np.abs(ppd.measurement.adjoint(ppd.precond * ppd.vis)).max() * ppd.l2_step)
+def _mean_brightness(model):
+    """Mean brightness of the flux, Σx²/Σ|x|, Jy/pixel; 1 for an empty image."""
+    flux = np.abs(model).sum(dtype=float)
+    return float(np.square(model, dtype=float).sum() / flux) if flux > 0 else 1.0

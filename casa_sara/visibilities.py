@@ -159,7 +159,9 @@ def snapshot_blocks(visibilities, blocks=0):
         When `blocks` is negative or exceeds the number of samples.
     """
     if not 0 <= blocks <= visibilities.size:
-        raise ValueError(f"blocks = {blocks}: it takes 0 (automatic) or 1 to {visibilities.size}, the number of visibilities")
+        raise ValueError(
+            f"blocks = {blocks}: it takes 0 (automatic) or 1 to {visibilities.size}, the number of visibilities"
+        )
     if blocks:
         block_of_sample = _equal_blocks(visibilities, blocks)
     else:
@@ -202,15 +204,22 @@ def _blocks_of_rows(visibilities):
 
 def _numbered(major, minor):
     """Number the distinct pairs of integers, sorted, and return the number of each element."""
-    return np.unique(major * (minor.max() + 1) + minor, return_inverse=True)[1]
+    lowest = minor.min()
+    return np.unique(major * (minor.max() - lowest + 1) + minor - lowest, return_inverse=True)[1]
+
+
+def _extents(number, time):
+    """Return the first and last time of each group of rows."""
+    count = number.max() + 1
+    start, end = np.full(count, np.inf), np.full(count, -np.inf)
+    np.minimum.at(start, number, time)
+    np.maximum.at(end, number, time)
+    return start, end
 
 
 def _time_spans(scan, time, samples):
     """Number the equal spans of time within each scan that bring it below the limits."""
-    count = scan.max() + 1
-    start, end = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(start, scan, time)
-    np.maximum.at(end, scan, time)
+    start, end = _extents(scan, time)
     length = end - start
     total = np.bincount(scan, weights=samples)
     spans = np.ceil(np.maximum(np.maximum(length / SNAPSHOT_SECONDS, total / SNAPSHOT_SAMPLES), 1)).astype(int)
@@ -220,14 +229,11 @@ def _time_spans(scan, time, samples):
 
 def _join_small(piece, session, time, samples):
     """Join pieces that are too small to their neighbours; return the block of every row, along time."""
-    count = piece.max() + 1
-    start, end = np.full(count, np.inf), np.full(count, -np.inf)
-    np.minimum.at(start, piece, time)
-    np.maximum.at(end, piece, time)
+    start, end = _extents(piece, time)
     size = np.bincount(piece, weights=samples)
-    home = np.zeros(count, dtype=np.int64)
+    home = np.zeros(start.size, dtype=np.int64)
     home[piece] = session
-    number = np.empty(count, dtype=np.int32)
+    number = np.empty(start.size, dtype=np.int32)
     blocks = 0
     for current in np.unique(home):
         here = np.flatnonzero(home == current)

@@ -21,21 +21,16 @@ from casa_sara.options import ImageGrid, Selection, Weighting
 
 ARCSEC = np.pi / 180 / 3600
 DATA = Path(__file__).resolve().parents[2] / "shared/data/ms"
-WEIGHTINGS = {
-    "natural": Weighting("natural"),
-    "uniform": Weighting("uniform"),
-    "briggs_-1": Weighting("briggs", robust=-1.0),
-    "briggs_0": Weighting("briggs", robust=0.0),
-    "briggs_1": Weighting("briggs", robust=1.0),
-}
-# name of the tar file: (shape, cell in arcsec, selection)
+TAPERED = Weighting("briggs", 0.0, uvtaper=("1arcsec", "0.5arcsec", "30deg"))
+# name of the tar file: (shape, cell in arcsec, selection, limit). The line data are noise for
+# the most part, so tclean's rounding shows in full.
 REAL = {
-    "VLA_3C273_X": ((120, 150), 0.5, {}),
-    "ALMA_HD142527_B9cont": ((150, 150), 0.04, {"spw": "1,2", "antenna": "0~5"}),
-    "EHT_M87_2017_101_selfcal": ((64, 64), 3e-6, {}),
-    "VLA_NGC5921_cont": ((128, 100), 15.0, {}),
-    "VLA_NGC5921_HI_ch16-45": ((100, 128), 15.0, {"spw": "0:8~22"}),
-    "SMA_DMTau_CO21": ((96, 90), 0.4, {"spw": "0:3~5"}),
+    "VLA_3C273_X": ((96, 90), 0.5, {}, 1e-3),
+    "ALMA_HD142527_B9cont": ((100, 90), 0.04, {"scan": "1,2"}, 1e-3),
+    "EHT_M87_2017_101_selfcal": ((64, 60), 2e-6, {}, 1e-3),
+    "VLA_NGC5921_cont": ((100, 90), 15.0, {}, 1e-3),
+    "VLA_NGC5921_HI_ch16-45": ((64, 70), 15.0, {"spw": "0:8~22"}, 2e-3),
+    "SMA_DMTau_CO21": ((64, 60), 0.4, {"spw": "0:3~5", "scan": "1~4"}, 1e-3),
 }
 
 
@@ -137,27 +132,43 @@ def observation(tmp_path_factory):
     return made
 
 
-@pytest.mark.parametrize("weighting", [*WEIGHTINGS.values(), Weighting("briggs", 0.0, uvtaper=("1arcsec", "0.5arcsec", "30deg"))], ids=str)
-@pytest.mark.parametrize("configuration, cell", [("a", 0.05), ("d", 2.0)])
+def brief(weighting):
+    return f"{weighting.weighting}{weighting.robust:g}" if weighting.weighting == "briggs" else weighting.weighting
+
+
+@pytest.mark.parametrize(
+    "configuration, cell, weighting",
+    [
+        ("a", 0.05, Weighting("natural")),
+        ("a", 0.05, Weighting("uniform")),
+        ("a", 0.05, Weighting("briggs", -1.0)),
+        ("a", 0.05, Weighting("briggs", 1.0)),
+        ("a", 0.05, TAPERED),
+        ("d", 2.0, Weighting("natural")),
+        ("d", 2.0, Weighting("uniform", uvtaper=("4klambda",))),
+        ("d", 2.0, Weighting("briggs", 0.0)),
+    ],
+    ids=lambda value: brief(value) if isinstance(value, Weighting) else value,
+)
 def test_simulated(observation, folder, configuration, cell, weighting):
     check(compare(observation[configuration], folder, (120, 100), cell, weighting, {"datacolumn": "data"}))
 
 
-@pytest.mark.parametrize("weighting", [WEIGHTINGS["uniform"], Weighting("briggs", -0.5, npixels=30)], ids=str)
+@pytest.mark.parametrize("weighting", [Weighting("uniform"), Weighting("briggs", -0.5, npixels=30)], ids=brief)
 def test_image_centre_off_the_field(observation, folder, weighting):
     check(compare(observation["d"], folder, (101, 128), 2.0, weighting, {"datacolumn": "data"}, "J2000 19h59m30.5s +40d44m20s"))
 
 
 def test_several_measurement_sets(observation, folder):
     vis = (observation["a"], observation["d"])
-    check(compare(vis, folder, (128, 128), 0.05, WEIGHTINGS["briggs_0"], {"datacolumn": "data", "spw": "0"}))
+    check(compare(vis, folder, (128, 128), 0.05, Weighting("briggs", 0.0), {"datacolumn": "data", "spw": "0"}))
 
 
-@pytest.mark.parametrize("weighting", WEIGHTINGS.values(), ids=WEIGHTINGS)
+@pytest.mark.parametrize("weighting", [Weighting("natural"), Weighting("uniform"), Weighting("briggs", 0.0)], ids=brief)
 @pytest.mark.parametrize("name", REAL)
 def test_real(real_ms, folder, name, weighting):
-    shape, cell, selection = REAL[name]
-    check(compare(real_ms(name), folder, shape, cell, weighting, selection))
+    shape, cell, selection, limit = REAL[name]
+    check(compare(real_ms(name), folder, shape, cell, weighting, selection), limit)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,7 @@ NOT_IMPORTED = {
     "casadata": "the data that CASA needs to be imported at all",
     "six": "casatasks imports it and does not require it",
 }
-CASA = {"casatools", "casatasks"}
+CASA = {"casaconfig", "casatools", "casatasks"}
 
 # What each room may import beside itself and the standard library: other rooms and packages.
 ROOMS = {

@@ -44,11 +44,11 @@ def scans_of(infos):
 
 
 def test_one_block_for_each_scan_along_time():
-    vis = observation([(0, 0, 7, 0, 60), (0, 0, 2, 1000, 60), (0, 1, 2, 3000, 60), (1, 0, 2, -5000, 60)])
+    vis = observation([(0, 0, 7, 0, 60), (0, 0, -1, 1000, 60), (0, 1, 7, 3000, 60), (1, 0, 2, -5000, 60)])
     number, infos = snapshot_blocks(vis)
     assert number.dtype == np.int32 and number.shape == (vis.size,)
     assert [(info.ms_name, info.observations, info.scans) for info in infos] == [
-        ("0.ms", (0,), (7,)), ("0.ms", (0,), (2,)), ("0.ms", (1,), (2,)), ("1.ms", (0,), (2,)),
+        ("0.ms", (0,), (7,)), ("0.ms", (0,), (-1,)), ("0.ms", (1,), (7,)), ("1.ms", (0,), (2,)),
     ]  # fmt: skip
     rows = vis.rows
     for block, info in enumerate(infos):

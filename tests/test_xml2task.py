@@ -1,10 +1,13 @@
 """The generator of the tasks: the committed output is current, and bad XML is refused."""
 
+import inspect
 import shutil
 import sys
 from pathlib import Path
 
 import pytest
+
+from casa_sara.private.validation import Parameter
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -192,10 +195,6 @@ def test_check_names_every_stale_file_and_writes_nothing(tmp_path, capsys):
 
 
 def test_generated_task_has_what_the_xml_has(tmp_path):
-    import inspect
-
-    from casa_sara.private.validation import Parameter
-
     xml = write(tmp_path, SMALL)
     module = {}
     exec(compile(xml2task.plain_task(taskxml.read_task(xml)), str(xml), "exec"), module)
@@ -208,8 +207,8 @@ def test_generated_task_has_what_the_xml_has(tmp_path):
         Parameter("steps", ("int",), 3, "Steps"),
         Parameter("names", ("stringVec",), ["a"], "Names", opener="steps", open_unless=(0,)),
     )
-    assert "softness : float, default 0.5\n        Opened by mode = 'soft'.\n        How soft.\n          Very.\n" in (
-        module["small"].__doc__)
+    softness = "softness : float, default 0.5\n    Opened by mode = 'soft'.\n    How soft.\n      Very.\n"
+    assert softness in inspect.getdoc(module["small"])
 
 
 def test_second_task_joins_the_packages(tmp_path):

@@ -1,7 +1,7 @@
-"""Pictures that set several reconstructions of one sky side by side, on common scales.
+"""Pictures that set several images of one sky side by side, on common scales.
 
 Models (Jy/pixel) and restored images (Jy/beam) are both shown as brightness, in mJy/arcsec², so that one
-logarithmic scale serves all; residuals, in units of their beam, have a scale of their own.
+logarithmic scale serves all; residuals, in mJy/beam, have a scale of their own.
 """
 
 from __future__ import annotations
@@ -10,43 +10,49 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.ticker import MaxNLocator
 
-__all__ = ["Reconstruction", "Zoom", "compare"]
+__all__ = ["Column", "Zoom", "compare"]
 
 BRIGHTNESS_MAP = "inferno"
 RESIDUAL_MAP = "RdBu_r"
 LINE = "0.75"
 TEXT = {"fontsize": 9}
+WIDTH, GAP = 4.2, 0.06  # of a panel and between panels, in inches
+LEFT, RIGHT, TOP, BOTTOM, LABELS = 0.6, 0.85, 0.68, 0.1, 0.48  # margins; room for the labels above the zooms
 
 
 @dataclass(frozen=True)
-class Reconstruction:
-    """One column of the picture. Images are (nx, ny), indexed [ix, iy], or None where there is none.
+class Column:
+    """One column of the picture. Images are (nx, ny), indexed [ix, iy].
 
     Attributes
     ----------
     name : str
     model : array_like
         Jy/pixel.
-    restored, residual : array_like, optional
+    restored : array_like
         Jy/beam.
-    beam : (float, float, float), optional
+    residual : array_like, optional
+        Jy/beam; a truth has none.
+    beam : (float, float, float)
         Major and minor axis in arcsec (FWHM) and position angle in degrees from north through east.
     caption : str
-        Lines printed into the panel of the model.
+        Printed into the panel of the model.
     note : str
-        Lines printed in place of a residual, for a reconstruction (the truth) that has none.
+        Printed in place of a residual that there is not.
     """
 
     name: str
     model: np.ndarray
-    restored: np.ndarray | None = None
-    residual: np.ndarray | None = None
-    beam: tuple[float, float, float] | None = None
-    caption: str = ""
+    restored: np.ndarray
+    residual: np.ndarray | None
+    beam: tuple[float, float, float]
+    caption: str = "model"
     note: str = ""
 
 
@@ -60,102 +66,98 @@ class Zoom:
     side: float
 
 
-def compare(
-    path, reconstructions: Sequence[Reconstruction], cell_arcsec: float, zooms: Sequence[Zoom] = (), decades=3.5, title=""
-) -> None:
-    """Draw models, restored images and residuals of several reconstructions, a column for each.
+def compare(path, columns: Sequence[Column], cell_arcsec: float, zooms: Sequence[Zoom], decades=3.5, title="") -> None:
+    """Draw models, restored images, residuals and enlarged parts of the models, a column for each reconstruction.
 
     Parameters
     ----------
     path : str or Path
         Image file to write; matplotlib goes by its suffix.
-    reconstructions : sequence of Reconstruction
-        The first one sets the scale, so let it be the truth or the best.
+    columns : sequence of Column
+        The peak of the first one's model sets the scale, so let it be the truth or the best.
     cell_arcsec : float
     zooms : sequence of Zoom
-        Enlarged parts of the models, shown below.
+        Enlarged parts of the models, side by side below.
     decades : float
-        Range of the logarithmic scale below the peak of the first model.
+        Range of the logarithmic scale.
     title : str
     """
-    peak = 1e3 * np.max(reconstructions[0].model) / cell_arcsec**2
-    brightness = LogNorm(peak / 10**decades, peak)
-    rms = [np.nanstd(r.residual) for r in reconstructions if r.residual is not None]
-    noise = Normalize(-4e3 * np.median(rms), 4e3 * np.median(rms))
+    peak = 1e3 * np.max(columns[0].model) / cell_arcsec**2
+    rms = 1e3 * np.median([np.nanstd(column.residual) for column in columns if column.residual is not None])
+    brightness, noise = LogNorm(peak / 10**decades, peak), Normalize(-4 * rms, 4 * rms)
 
-    nx, ny = reconstructions[0].model.shape
-    columns, width, gap, labels = len(reconstructions), 4.2, 0.06, 0.48  # inches
-    left, right, top, bottom = 0.6, 0.85, 0.68, 0.1
-    height, side = width * ny / nx, (width - gap * (len(zooms) - 1)) / max(len(zooms), 1)
-    tops = top + np.array([0, height + gap, 2 * (height + gap), 3 * height + 2 * gap + labels])
-    size = (left + columns * (width + gap) - gap + right, tops[3] + side * bool(zooms) + bottom)
+    nx, ny = columns[0].model.shape
+    height, side = WIDTH * ny / nx, (WIDTH - GAP * (len(zooms) - 1)) / len(zooms)
+    tops = TOP + np.array([0, height + GAP, 2 * (height + GAP), 3 * height + 2 * GAP + LABELS])
+    size = (LEFT + len(columns) * (WIDTH + GAP) - GAP + RIGHT, tops[3] + side + BOTTOM)
     figure = Figure(figsize=size, dpi=150, facecolor="white")
 
-    def axes(left, top, w, h):
-        return figure.add_axes([left / size[0], 1 - (top + h) / size[1], w / size[0], h / size[1]])
+    def axes(left, top, width, height):
+        return figure.add_axes([left / size[0], 1 - (top + height) / size[1], width / size[0], height / size[1]])
 
-    for column, reconstruction in enumerate(reconstructions):
-        edge = left + column * (width + gap)
-        for row, kind in enumerate(("model", "restored", "residual")):
-            panel = axes(edge, tops[row], width, height)
-            drawn = _panel(panel, reconstruction, kind, cell_arcsec, noise if kind == "residual" else brightness)
-            _label_axes(panel, first=column == 0, last=row == 2)
-            if column == columns - 1 and kind != "restored":
-                bar = axes(edge + width + 0.1, tops[row], 0.13, height if kind == "residual" else 2 * height + gap)
-                figure.colorbar(drawn, cax=bar).set_label(f"mJy {'beam' if kind == 'residual' else 'arcsec'}$^{{-{1 + (kind == 'model')}}}$", **TEXT)
-                bar.tick_params(labelsize=8)
+    for number, column in enumerate(columns):
+        left = LEFT + number * (WIDTH + GAP)
+        for top, kind in zip(tops, ("model", "restored", "residual")):
+            panel = axes(left, top, WIDTH, height)
+            drawn = _panel(panel, column, kind, cell_arcsec, noise if kind == "residual" else brightness)
+            _label_axes(panel, first=number == 0, last=kind == "residual")
             if kind == "model":
-                panel.set_title(reconstruction.name, fontsize=12)
+                panel.set_title(column.name, fontsize=12)
                 _mark(panel, zooms)
-        for number, zoom in enumerate(zooms):
-            panel = axes(edge + number * (side + gap), tops[3], side, side)
-            _panel(panel, reconstruction, "model", cell_arcsec, brightness, zoom)
+        for place, zoom in enumerate(zooms):
+            panel = axes(left + place * (side + GAP), tops[3], side, side)
+            _draw(panel, column.model, 1e3 / cell_arcsec**2, cell_arcsec, brightness)
+            _frame(panel, zoom)
+    _bar(axes(left + WIDTH + 0.1, tops[0], 0.13, 2 * height + GAP), brightness, BRIGHTNESS_MAP, "mJy arcsec$^{-2}$")
+    _bar(axes(left + WIDTH + 0.1, tops[2], 0.13, height), noise, RESIDUAL_MAP, "mJy beam$^{-1}$")
     figure.text(0.5, 1 - 0.2 / size[1], title, ha="center", va="center", fontsize=14)
     figure.savefig(path)
 
 
-def _panel(panel, reconstruction, kind, cell, norm, zoom=None):
-    """Draw one image of a reconstruction, with its beam and caption; return what was drawn."""
-    image = getattr(reconstruction, kind)
-    if image is None:
-        panel.set_axis_off()
-        panel.text(0.02, 0.9, reconstruction.note, va="top", linespacing=1.5, transform=panel.transAxes, **TEXT)
-        return None
-    scale = 1e3
+def _panel(panel, column, kind, cell, norm) -> None:
+    """Draw one image of a column with its beam and caption, or the column's note."""
+    major, minor, _ = column.beam
+    place = {"va": "top", "transform": panel.transAxes, **TEXT}
     if kind == "model":
-        scale /= cell**2
+        _draw(panel, column.model, 1e3 / cell**2, cell, norm)
+        panel.text(0.02, 0.96, column.caption, color="white", **place)
     elif kind == "restored":
-        scale /= np.pi * reconstruction.beam[0] * reconstruction.beam[1] / (4 * np.log(2))
+        _draw(panel, column.restored, 1e3 * 4 * np.log(2) / (np.pi * major * minor), cell, norm)
+        made = "smoothed" if column.residual is None else "restored"
+        panel.text(0.02, 0.96, f'{made}, beam {major:.2f}" × {minor:.2f}"', color="white", **place)
+        _beam(panel, column.beam, "white")
+    elif column.residual is not None:
+        _draw(panel, column.residual, 1e3, cell, norm)
+        ground = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
+        text = f"residual, rms {1e3 * np.nanstd(column.residual):.2g} mJy/beam"
+        panel.text(0.02, 0.96, text, bbox=ground, **place)
+        _beam(panel, column.beam, "black")
+    else:
+        panel.set_axis_off()
+        panel.text(0.02, 0.9, column.note, linespacing=1.6, **place)
+
+
+def _draw(panel, image, scale, cell, norm) -> None:
+    """Draw an image times `scale`; the axes are offsets in arcsec from pixel [nx//2, ny//2], east to the left."""
     nx, ny = image.shape
-    extent = np.array([nx // 2 + 0.5, nx // 2 + 0.5 - nx, -ny // 2 - 0.5, -ny // 2 - 0.5 + ny]) * cell
-    shown = np.maximum(scale * np.asarray(image), norm.vmin) if isinstance(norm, LogNorm) else scale * np.asarray(image)
-    colours = BRIGHTNESS_MAP if isinstance(norm, LogNorm) else RESIDUAL_MAP
-    drawn = panel.imshow(shown.T, origin="lower", extent=extent, norm=norm, cmap=colours, interpolation="nearest")
-    if zoom is not None:
-        _frame(panel, zoom)
-        return drawn
-    ink = "black" if kind == "residual" else "white"
-    text = reconstruction.caption if kind == "model" else _beam_text(kind, reconstruction)
-    panel.text(0.02, 0.96, text, color=ink, va="top", transform=panel.transAxes, **TEXT)
-    if kind != "model":
-        _beam(panel, reconstruction.beam, extent, ink)
-    return drawn
+    extent = np.array([nx // 2 + 0.5, nx // 2 + 0.5 - nx, -(ny // 2) - 0.5, ny - ny // 2 - 0.5]) * cell
+    shown, colours = scale * np.asarray(image), RESIDUAL_MAP
+    if isinstance(norm, LogNorm):
+        shown, colours = np.maximum(shown, norm.vmin), BRIGHTNESS_MAP
+    panel.imshow(shown.T, origin="lower", extent=extent, norm=norm, cmap=colours, interpolation="nearest")
 
 
 def _frame(panel, zoom) -> None:
-    """Cut the panel to the zoom and give it a scale bar."""
+    """Cut a panel to the zoom and give it a scale bar."""
     half = zoom.side / 2
-    panel.set_xlim(zoom.east + half, zoom.east - half)
-    panel.set_ylim(zoom.north - half, zoom.north + half)
-    panel.set_xticks([])
-    panel.set_yticks([])
+    panel.set(xlim=(zoom.east + half, zoom.east - half), ylim=(zoom.north - half, zoom.north + half), xticks=[], yticks=[])
     panel.spines[:].set_color(LINE)
     panel.text(0.04, 0.95, zoom.name, color="white", va="top", transform=panel.transAxes, **TEXT)
-    length = 10 ** np.floor(np.log10(half))
-    length *= max(f for f in (1, 2, 5) if f * length <= half)
-    start = zoom.east - half * 0.9 + length
-    panel.plot([start, start - length], [zoom.north - half * 0.85] * 2, color="white", lw=1.5)
-    panel.text(start - length / 2, zoom.north - half * 0.8, f'{length:g}"', color="white", ha="center", **TEXT)
+    unit = 10 ** np.floor(np.log10(half))
+    length = unit * max(factor for factor in (1, 2, 5) if factor * unit <= half)
+    start, height = zoom.east - 0.9 * half + length, zoom.north - 0.85 * half
+    panel.plot([start, start - length], [height] * 2, color="white", lw=1.5)
+    panel.text(start - length / 2, height + 0.05 * half, f'{length:g}"', color="white", ha="center", **TEXT)
 
 
 def _mark(panel, zooms) -> None:
@@ -165,27 +167,26 @@ def _mark(panel, zooms) -> None:
         panel.add_patch(Rectangle(corner, zoom.side, zoom.side, fill=False, color=LINE, lw=0.7))
 
 
-def _beam_text(kind, reconstruction) -> str:
-    """Return what a panel in Jy/beam is labelled with."""
-    if kind == "residual":
-        return f"residual, rms {1e3 * np.nanstd(reconstruction.residual):.2g} mJy/beam"
-    major, minor, _ = reconstruction.beam
-    made = "restored" if reconstruction.residual is not None else "smoothed"
-    return f'{made}, beam {major:.2f}" × {minor:.2f}"'
-
-
-def _beam(panel, beam, extent, colour) -> None:
+def _beam(panel, beam, colour) -> None:
     """Draw the beam into the lower left corner."""
     major, minor, angle = beam
-    away = 0.6 * major + 0.02 * (extent[0] - extent[1])
-    corner = extent[0] - away, extent[2] + away
-    panel.add_patch(Ellipse(corner, minor, major, angle=-angle, color=colour, lw=0.8, fill=False))
+    (east, west), south = panel.get_xlim(), panel.get_ylim()[0]
+    away = 0.6 * major + 0.02 * (east - west)
+    panel.add_patch(Ellipse((east - away, south + away), minor, major, angle=-angle, color=colour, lw=0.8, fill=False))
 
 
 def _label_axes(panel, first, last) -> None:
     """Write offsets in arcsec along the outer edges only."""
     panel.tick_params(labelsize=8, color=LINE, direction="in", labelleft=first, labelbottom=last)
+    for axis in (panel.xaxis, panel.yaxis):
+        axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10], prune="both"))
     if first:
         panel.set_ylabel("north [arcsec]", **TEXT)
     if last:
         panel.set_xlabel("east [arcsec]", **TEXT)
+
+
+def _bar(axes, norm, colours, unit) -> None:
+    """Draw a colour bar into `axes`."""
+    axes.figure.colorbar(ScalarMappable(norm, colours), cax=axes).set_label(unit, **TEXT)
+    axes.tick_params(labelsize=8)

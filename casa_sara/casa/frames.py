@@ -116,9 +116,9 @@ def rotation_between(field, image):
     """
     basis_field, basis_image = _basis(field), _basis(image)
     if field["refer"] != image["refer"]:
-        step = 1e-3
-        towards = _converted(basis_field[2], field["refer"], image["refer"])
-        ahead = _converted(np.cos(step) * basis_field[2] + np.sin(step) * basis_field[1], field["refer"], image["refer"])
+        step, frames = 1e-3, (field["refer"], image["refer"])
+        towards = _converted(basis_field[2], *frames)
+        ahead = _converted(np.cos(step) * basis_field[2] + np.sin(step) * basis_field[1], *frames)
         north = ahead - towards * (towards @ ahead)
         north /= np.linalg.norm(north)
         basis_field = np.array([np.cross(north, towards), north, towards])

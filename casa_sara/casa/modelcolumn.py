@@ -181,7 +181,8 @@ def _signals_deferred():
         yield
         return
     received = []
-    before = {number: signal.signal(number, lambda *got: received.append(got[0])) for number in (signal.SIGINT, signal.SIGTERM)}
+    deferred = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *got: received.append(got[0])) for number in deferred}
     try:
         yield
     finally:

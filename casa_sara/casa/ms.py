@@ -177,8 +177,8 @@ class _SampleTable:
         }
         for name, values in new.items():
             self._samples[name].append(values)
-        columns = columns | {"row": chunk.rows, "ms": np.full(kept.size, ms.number), "spw": np.full(kept.size, group.spw)}
-        for name, values in columns.items():
+        of_group = {name: np.full(kept.size, value) for name, value in (("ms", ms.number), ("spw", group.spw))}
+        for name, values in (columns | of_group | {"row": chunk.rows}).items():
             self._rows[name].append(values[kept].astype(_ROW_DTYPES.get(name, np.int32)))
         self._rows_so_far += int(kept.sum())
         self.size += vis.size

@@ -78,7 +78,9 @@ def _check_channels(name, spw):
         for one in ranges.split(";"):
             channels = re.fullmatch(r"\s*(\d+)\s*(~\s*\d+\s*)?(\^\s*\d+\s*)?", one)
             if channels and int(channels[1]) > last:
-                raise ValueError(f"spw = '{spw}': channel {channels[1]} is beyond {last}, the last of spw {window} in '{name}'")
+                raise ValueError(
+                    f"spw = '{spw}': channel {channels[1]} is beyond {last}, the last of spw {window} in '{name}'"
+                )
 
 
 def _rows_with_channels(name, rows, channels):

@@ -126,7 +126,9 @@ def _check_measurement_set(name):
     if not os.path.exists(name):
         raise FileNotFoundError(f"vis = '{name}' does not exist")
     if not os.path.isdir(name):
-        raise ValueError(f"vis = '{name}' is a file: a MeasurementSet is a directory (importuvfits makes one of a UVFITS file)")
+        raise ValueError(
+            f"vis = '{name}' is a file: a MeasurementSet is a directory (importuvfits makes one of a UVFITS file)"
+        )
     if not os.path.exists(os.path.join(name, "table.dat")):
         raise ValueError(f"vis = '{name}' is a directory, but not a MeasurementSet: it holds no table.dat")
     try:
@@ -172,7 +174,7 @@ def _describe(number, name, column, rows, channels, notes):
             codes = np.ravel(md.corrtypesforpol(md.polidfordatadesc(int(dd)))).tolist()
             chosen = channels.get(spw, np.arange(md.nchan(spw)))
             if chosen[-1] > _LAST_CHANNEL:
-                raise ValueError(f"spw: channel {chosen[-1]} of spw {spw} in '{name}' is beyond {_LAST_CHANNEL}, the last that can be imaged")
+                raise ValueError(f"spw {spw} of '{name}': channels beyond {_LAST_CHANNEL} cannot be imaged, select others")
             groups.append(
                 RowGroup(
                     spw=spw,
@@ -211,7 +213,8 @@ def _parallel_hands(name, spw, codes, notes):
             return tuple(codes.index(code) for code in sorted(pair))
     if len(codes) == 1 and codes[0] in _SINGLE:
         if codes[0] != 1:
-            note = f"'{name}' holds {_STOKES_CODES[codes[0]]} alone: it is imaged as Stokes I, as if the source were unpolarised"
+            hand = _STOKES_CODES[codes[0]]
+            note = f"'{name}' holds {hand} alone: it is imaged as Stokes I, as if the source were unpolarised"
             if note not in notes:
                 notes.append(note)
         return (0,)

@@ -249,27 +249,31 @@ def _synthesise_quad(table, n, taps, length, to, line):
 
 
 @_jit
-def _add_pixels(at, even, odd):
-    store(at, load(at, even) + zip_low(even, odd))
-    store(at + VECTOR_BYTES, load(at + VECTOR_BYTES, even) + zip_high(even, odd))
+def _put_pixels(at, even, odd, add):
+    low, high = zip_low(even, odd), zip_high(even, odd)
+    if add:
+        low = low + load(at, low)
+        high = high + load(at + VECTOR_BYTES, high)
+    store(at, low)
+    store(at + VECTOR_BYTES, high)
 
 
 @_jit
-def _synthesise_pair(table, n, taps, length, shift, line, out, step):
-    """Add two image lines, from their a and d halves in scratch, to `out`."""
+def _synthesise_pair(table, n, taps, length, shift, line, out, step, add):
+    """Two image lines, from their a and d halves in scratch, to `out` or added to it."""
     for k in range(0, n * taps.itemsize, 2 * VECTOR_BYTES):
         e, o = shift + k, shift + k + 2 * line
         v = _synthesise_along(table, (e, e + VECTOR_BYTES, o, o + VECTOR_BYTES), taps, length, 0)
         at = out + 2 * k
-        _add_pixels(at, v[0], v[1])
-        _add_pixels(at + 2 * VECTOR_BYTES, v[2], v[3])
-        _add_pixels(at + step, v[4], v[5])
-        _add_pixels(at + step + 2 * VECTOR_BYTES, v[6], v[7])
+        _put_pixels(at, v[0], v[1], add)
+        _put_pixels(at + 2 * VECTOR_BYTES, v[2], v[3], add)
+        _put_pixels(at + step, v[4], v[5], add)
+        _put_pixels(at + step + 2 * VECTOR_BYTES, v[6], v[7], add)
 
 
 @_jit
 def _synthesise(low, filters, coefs, work, worker, b, level, out, origin, begin, end):
-    """Add image lines [2 begin, 2 end) of one level to `out`, whose first line is line `origin`."""
+    """Image lines [2 begin, 2 end) of one level to `out`, whose first line is line `origin`; added at level 1."""
     length = filters.lengths[b]
     late = 2 if length % 4 == 0 else 0
     nx, ny = coefs.shape[1] >> level, coefs.shape[2] >> level
@@ -296,7 +300,7 @@ def _synthesise(low, filters, coefs, work, worker, b, level, out, origin, begin,
         _wrap(scratch, ny)
         for i in range(j, min(j + 2, end)):
             _synthesise_pair(tables[2], ny, taps, length, 4 * (i - j) * line, line,
-                             _address(out, 2 * i - origin), out_step)
+                             _address(out, 2 * i - origin), out_step, level == 1)
 
 
 @_jit
@@ -346,7 +350,6 @@ def transform_deeper(filters, target, work, owner, forth, back, worker, workers)
         if back:
             for level in range(levels, 1, -1):
                 out = _approx(work, shape, b, level - 1)
-                out[:] = 0
                 low = target.coefs[b] if level == levels else _approx(work, shape, b, level)
                 _synthesise(low, filters, target.coefs, work, worker, b, level, out, 0, 0, shape[0] >> level)
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import brentq
 
-__all__ = ["alias_level", "kernel", "kernel_polynomial", "kernel_shape", "padding", "transform"]
+__all__ = ["alias_level", "gain", "kernel", "kernel_polynomial", "kernel_shape", "padding", "transform"]
 
 
 def kernel_shape(width, sigma):
@@ -40,6 +40,12 @@ def alias_level(width, sigma):
     orders = np.concatenate([np.arange(-16, 0), np.arange(1, 17)])
     aliases = transform(xi[:, None] + orders, width, beta)
     return np.max(np.sqrt(np.sum(aliases**2, axis=1)) / transform(xi, width, beta))
+
+
+def gain(width, sigma):
+    """Largest ratio of the kernel's transform over the signal."""
+    ends = transform([0, 0.5 / sigma], width, kernel_shape(width, sigma))
+    return ends[0] / ends[1]
 
 
 def padding(width, eps, low=1.1, high=4.0):

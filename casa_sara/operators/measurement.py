@@ -1,25 +1,36 @@
 """The measurement operator Φ: model image to visibilities, and its adjoint.
 
-A point source of unit flux at pixel (ix, iy) contributes to visibility m
+A point source of unit flux at pixel (ix, iy) contributes to visibility k
 
-    exp(+2πi (u_m l + v_m m)),   l = −(ix − nx//2)·cell_x,   m = (iy − ny//2)·cell_y,
+    exp(+2πi (u_k l + v_k m)),   l = −(ix − nx//2)·cell_x,   m = (iy − ny//2)·cell_y,
 
 with (u, v) in wavelengths and l (east), m (north) in radians.  This is the sign
 convention of the MeasurementSet and of tclean, without the w-term.
+
+A real image needs half of the Fourier plane only, and visibilities that reach over the
+inner part of it need fewer samples than the image has pixels: the image is decimated
+(`decimation.py`) before a non-uniform FFT (`nufft.py`).  All visibilities go through one
+transform; the blocks of the data are slices of its result.
 """
 
 from __future__ import annotations
 
-import finufft
 import numpy as np
 
-__all__ = ["MeasurementOperator"]
+from casa_sara.operators._workers import Workers
+from casa_sara.operators.decimation import AxisDecimation, Separable, decimate, expand, expand_rows, scratch_shape
+from casa_sara.operators.nufft import NonUniformFFT
+
+__all__ = ["MeasurementOperator", "choose_eps", "dirty_image", "psf"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
+SMALLEST_EPS = {np.dtype(np.float32): 1e-6, np.dtype(np.float64): 1e-13}
 
 
 class MeasurementOperator:
     """Non-uniform Fourier transform of a real image, built once and applied often.
+
+    Calls share work space: one operator serves one thread at a time (and uses `nthreads` itself).
 
     Parameters
     ----------
@@ -32,53 +43,138 @@ class MeasurementOperator:
     row_scale : real (M,), optional
         Factor on each visibility, e.g. the square root of its weight for whitening.
     eps : float
-        Relative accuracy of the transform.
+        Accuracy: bound on ‖error‖/‖result‖; at least 1e-6 in single and 1e-13 in double precision.
     dtype : float32 or float64
         Of images; visibilities are complex of the same precision.
     nthreads : int
-        Threads used by each transform.
+        Threads used by each call.
 
     Raises
     ------
     ValueError
-        `uv`, `shape`, `row_scale` unusable, or `cell` too large for the longest baseline.
+        For an argument out of these ranges, or a `cell` too large for the longest baseline.
     """
 
     def __init__(self, uv, cell_rad, shape, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1):
         uv = np.asarray(uv, dtype=np.float64)
-        if uv.ndim != 2 or uv.shape[0] != 2 or uv.shape[1] == 0:
-            raise ValueError(f"uv must have shape (2, M) with M >= 1, not {uv.shape}")
+        if uv.ndim != 2 or uv.shape[0] != 2 or uv.shape[1] == 0 or not np.all(np.isfinite(uv)):
+            raise ValueError(f"uv must be finite and of shape (2, M) with M >= 1, not {uv.shape}")
         self.shape = tuple(int(n) for n in shape)
-        self.size = uv.shape[1]
-        self.dtype = np.dtype(dtype)
+        if len(self.shape) != 2 or min(self.shape) < 1:
+            raise ValueError(f"imsize must be two sizes of at least 1 pixel, not {self.shape}")
+        self.size, self.dtype = uv.shape[1], np.dtype(dtype)
+        if self.dtype not in SMALLEST_EPS:
+            raise ValueError(f"dtype must be float32 or float64, not {self.dtype}")
+        if not SMALLEST_EPS[self.dtype] <= eps < 1:
+            raise ValueError(f"eps={eps} must be at least {SMALLEST_EPS[self.dtype]} for {self.dtype}, and below 1")
         self.complex_dtype = np.result_type(self.dtype, np.complex64)
-        cell = np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))
-        reach = np.abs(uv).max(axis=1)
-        if np.any(reach * cell > 0.5):
-            largest = ARCSEC_PER_RAD * 0.5 / reach.max()
-            raise ValueError(f"cell={cell.max() * ARCSEC_PER_RAD:.4g} arcsec is too large for the longest "
-                             f"baseline: use at most cell='{largest:.4g}arcsec'")
-        self._row_scale = np.ones(self.size, self.dtype) if row_scale is None else np.array(row_scale, self.dtype)
-        if self._row_scale.shape != (self.size,):
-            raise ValueError(f"row_scale must have shape ({self.size},), not {self._row_scale.shape}")
-        self._plan = finufft.Plan(2, self.shape, eps=eps, isign=1, dtype=self.complex_dtype.name, nthreads=nthreads)
-        self._plan.setpts(np.ascontiguousarray(-2 * np.pi * cell[0] * uv[0], self.dtype),
-                          np.ascontiguousarray(2 * np.pi * cell[1] * uv[1], self.dtype))
-        self._image = np.zeros(self.shape, self.complex_dtype)
-        self._vis = np.zeros(self.size, self.complex_dtype)
+        row_scale = np.broadcast_to(1.0, self.size) if row_scale is None else np.asarray(row_scale, np.float64)
+        if row_scale.shape != (self.size,):
+            raise ValueError(f"row_scale must have shape ({self.size},), not {row_scale.shape}")
+        self._workers = Workers(nthreads)
+        frequencies = _cycles_per_pixel(uv, cell_rad)
+        sign = np.where(frequencies[1] < 0, -1.0, 1.0)  # V(−u, −v) is the conjugate of V(u, v)
+        self._plan(frequencies * sign, np.stack([row_scale, row_scale * sign], axis=1), eps / 2)
+
+    def _plan(self, frequencies, scales, eps):
+        """Decimation along both axes, then the transform of what it leaves."""
+        reach, precision = np.abs(frequencies[0]).max(), np.finfo(self.dtype).eps
+        axes = [AxisDecimation(self.shape[0], (-reach, reach), eps, precision),
+                AxisDecimation(self.shape[1], (0.0, frequencies[1].max()), eps, precision)]
+        response = axes[0].response(frequencies[0]) * axes[1].response(frequencies[1])
+        inner = np.stack([axis.factor * (f - axis.centre) for axis, f in zip(axes, frequencies)])
+        starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
+        self._nufft = NonUniformFFT(inner, scales / response[:, None], starts, counts, eps, self.dtype, self._workers)
+        self._rows = self._separable(axes[0], 0, self._nufft.rows, self._nufft.row_factors)
+        self._columns = self._separable(axes[1], 1, self._nufft.columns, self._nufft.column_factors)
+        self._lines = np.zeros((counts[0], self.shape[1]), self.dtype)
+        self._scratch = np.zeros(scratch_shape(self._columns, self._workers.count), self.dtype)
+
+    def _separable(self, axis, number, cells, factors):
+        first = axis.factor * axis.start - axis.taps.size // 2 + self.shape[number] // 2
+        gains = factors * axis.modulation(axis.start + np.arange(axis.count))
+        taps = np.concatenate([axis.taps.real, axis.taps.imag])
+        return Separable(taps.astype(self.dtype), axis.factor, first, cells, gains.astype(self.complex_dtype))
 
     def forward(self, image, out=None):
-        """Visibilities Φ·image, complex (M,), of a real image (nx, ny)."""
+        """Return the visibilities Φ·image, complex (M,), of a real image (nx, ny), in `out` where given."""
+        image = _checked(np.ascontiguousarray(image, self.dtype), "image", self.shape, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
-        self._image[...] = image
-        self._plan.execute(self._image, out)
-        out *= self._row_scale
+        _checked(out, "out", (self.size,), self.complex_dtype)
+        self._nufft.clear()
+        self._workers.run(decimate, image, self._rows, self._columns, self._nufft.grid, self._lines, self._scratch)
+        self._nufft.to_points(out)
         return out
 
     def adjoint(self, vis, out=None):
-        """Real image Re(Φ†·vis), (nx, ny), of complex visibilities (M,)."""
+        """Return the real image Re(Φ†·vis), (nx, ny), of complex visibilities (M,), in `out` where given.
+
+        It is the adjoint for real inner products: Re⟨Φx, y⟩ = ⟨x, adjoint(y)⟩.
+        """
+        vis = _checked(np.ascontiguousarray(vis, self.complex_dtype), "vis", (self.size,), self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
-        np.multiply(vis, self._row_scale, out=self._vis)
-        self._plan.execute_adjoint(self._vis, self._image)
-        out[...] = self._image.real
+        _checked(out, "out", self.shape, self.dtype)
+        self._nufft.from_points(vis)
+        self._workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
+        self._workers.run(expand_rows, self._lines, self._rows, out)
         return out
+
+
+def _cycles_per_pixel(uv, cell_rad):
+    """Baselines (2, M) as frequencies along the image axes."""
+    cell = np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))
+    if not np.all(cell > 0):
+        raise ValueError(f"cell={cell_rad} must be positive, in radians")
+    frequencies = uv * cell[:, None] * [[-1.0], [1.0]]
+    if np.abs(frequencies).max() > 0.5:
+        largest = 0.5 / np.abs(uv).max() * ARCSEC_PER_RAD
+        raise ValueError(f"cell={cell.max() * ARCSEC_PER_RAD:.4g}arcsec is too large for the longest baseline: "
+                         f"use at most cell={0.999 * largest:.4g}arcsec")
+    return frequencies
+
+
+def _checked(array, name, shape, dtype):
+    if array.shape != shape or array.dtype != dtype or not array.flags.c_contiguous:
+        raise ValueError(f"{name} must be a C-contiguous {dtype} array of shape {shape}")
+    return array
+
+
+def dirty_image(operator, vis, weights):
+    """Return the dirty image Σ_k w_k·Re(V_k·exp(−2πi…)) / Σ w, in Jy/beam as tclean's.
+
+    Parameters
+    ----------
+    operator : MeasurementOperator
+        Without `row_scale`; an accuracy of 1e-5 is plenty.
+    vis : complex (M,)
+        Jy; residual visibilities give the residual image.
+    weights : real (M,)
+        Natural, uniform or Briggs imaging weights.
+    """
+    return operator.adjoint(np.multiply(vis, weights)) / operator.dtype.type(np.sum(weights, dtype=np.float64))
+
+
+def psf(operator, weights):
+    """Return the point-spread function, the dirty image of a unit source at pixel (nx//2, ny//2), its peak 1."""
+    return dirty_image(operator, np.ones(operator.size, operator.complex_dtype), weights)
+
+
+def choose_eps(vis, weight, fraction=0.1):
+    """Return the accuracy at which the operator's errors are `fraction` of the noise.
+
+    Parameters
+    ----------
+    vis : complex (M,)
+        Jy.
+    weight : real (M,)
+        Inverse variance of the real part and of the imaginary part, 1/Jy².
+    fraction : float
+        Of the rms noise.
+
+    Returns
+    -------
+    float
+        Between 1e-7 and 1e-4.  Below 1e-6 the operator needs double precision.
+    """
+    signal = np.sqrt(np.mean(np.abs(vis) ** 2, dtype=np.float64) * np.mean(weight, dtype=np.float64))
+    return float(np.clip(fraction * np.sqrt(2) / max(signal, 1e-30), 1e-7, 1e-4))

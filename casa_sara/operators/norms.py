@@ -1,23 +1,58 @@
-"""Squared operator norms."""
+"""Squared norms of operators."""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.linalg import eigh_tridiagonal
 
 __all__ = ["power_method"]
 
 
-def power_method(apply, shape, dtype=np.float64, tol=1e-4, max_iter=200, seed=0):
-    """Largest eigenvalue of the symmetric positive `apply`: ‖A‖² for apply = A†A."""
-    x = np.random.default_rng(seed).standard_normal(shape).astype(dtype)
-    x /= np.linalg.norm(x)
-    value = 0.0
+def power_method(apply, shape, dtype=np.float64, tol=0.01, max_iter=200, seed=0):
+    """Return ‖A‖², from above, given `apply`, which maps an image x to A†A x.
+
+    Lanczos iterations, which need a fraction of the calls of plain powers: θ, the largest eigenvalue of A†A on the
+    Krylov space of a random image, grows towards ‖A‖², and an eigenvalue lies within the residual norm r of it.
+    Once r ≤ tol·θ and θ has settled, θ + r is returned: an upper bound with near certainty, too high by at most
+    a factor 1 + tol.
+
+    Parameters
+    ----------
+    apply : callable
+        (nx, ny) → (nx, ny), symmetric and positive semi-definite.
+    shape : tuple of int
+        Of the images.
+    dtype : float32 or float64
+        Of the images.
+    tol : float
+        Relative accuracy.
+    max_iter : int
+        Most calls of `apply`.
+    seed : int
+        Of the random first image.
+
+    Raises
+    ------
+    RuntimeError
+        When `max_iter` calls do not reach `tol`, or `apply` returns values that are not finite.
+    """
+    previous = np.zeros(shape, dtype)
+    vector = np.random.default_rng(seed).standard_normal(shape).astype(dtype)
+    vector /= np.linalg.norm(vector)
+    diagonal, off_diagonal, theta, beta = [], [], 0.0, 0.0
     for _ in range(max_iter):
-        y = apply(x)
-        previous, value = value, float(np.linalg.norm(y))
-        if value == 0.0:
-            return 0.0
-        x = y / dtype(value) if callable(dtype) else y / value
-        if abs(value - previous) <= tol * value:
-            break
-    return value * (1 + 10 * tol)
+        image = apply(vector) - vector.dtype.type(beta) * previous
+        diagonal.append(np.vdot(vector, image))
+        image -= diagonal[-1] * vector
+        beta = float(np.linalg.norm(image))
+        if not np.isfinite(beta):
+            raise RuntimeError("the operator returned values that are not finite")
+        last = len(diagonal) - 1
+        values, vectors = eigh_tridiagonal(diagonal, off_diagonal, select="i", select_range=(last, last))
+        theta, change = values[0], values[0] - theta
+        residual = beta * abs(vectors[-1, 0])
+        if residual <= tol * theta and change <= 0.1 * tol * theta:
+            return float(theta + residual)
+        off_diagonal.append(beta)
+        previous, vector = vector, image / vector.dtype.type(beta)
+    raise RuntimeError(f"the norm of the operator is not known to {tol:g} after {max_iter} iterations")

@@ -51,7 +51,7 @@ class NonUniformFFT:
 
     def __init__(self, frequencies, scales, starts, counts, eps, dtype, workers):
         self._workers = workers
-        width, sigma, lengths = _least_work(frequencies.shape[1], starts, counts, eps)
+        width, sigma, lengths = _least_work(frequencies.shape[1], starts, counts, eps, dtype)
         self._width, self._lanes = (0,) * width, (0,) * _lanes(width)
         self._halo, self._lengths = width // 2 + 1, lengths
         self._stride = 2 * (lengths[1] + 4)  # in reals; rows of 2^k cells would share cache lines
@@ -155,20 +155,24 @@ def _real_pairs(values):
     return values.view(values.real.dtype).reshape(-1, 2)
 
 
-def _least_work(n_points, starts, counts, eps):
-    """Kernel width, padding σ and grid lengths that take the least time (weights measured, in ns)."""
+def _least_work(n_points, starts, counts, eps, dtype):
+    """Kernel width, padding σ and grid lengths that take the least time (weights measured, in ns).
+
+    Round-off is amplified where the transform of the kernel is small; kernels with too much of that are left out.
+    """
+    largest_gain = 3 * np.sqrt(eps / np.finfo(dtype).eps)
     extents = 1 + 2 * np.maximum(np.negative(starts), np.add(starts, counts) - 1)
     plans = []
     for width in range(4, 17):
         sigma = kaiser_bessel.padding(width, eps)
-        if np.isfinite(sigma):
+        if np.isfinite(sigma) and kaiser_bessel.gain(width, sigma) < largest_gain:
             margin = (_lanes(width) // 2 + 1) / (0.5 - MAX_COLUMN_FREQUENCY)
             least = np.maximum(np.ceil(sigma * extents), (4 * (width // 2 + 1), margin)).astype(int)
             lengths = tuple(2 * scipy.fft.next_fast_len(int(n + 1) // 2) for n in least)
             points = n_points * (4 + 2.5 * width * _lanes(width) / 16)
             plans.append((points + 0.8 * np.prod(lengths) * np.log2(np.prod(lengths)), width, sigma, lengths))
     if not plans:
-        raise ValueError(f"eps={eps} is beyond double precision: use at least 1e-14")
+        raise ValueError(f"eps={eps} is too small to be reached in {np.dtype(dtype)}")
     return min(plans)[1:]
 
 

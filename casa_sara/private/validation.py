@@ -65,6 +65,17 @@ class Parameter(NamedTuple):
 def validate(parameters: tuple[Parameter, ...], values: dict[str, Any]) -> dict[str, Any]:
     """Return `values` with CASA's coercions applied.
 
+    Parameters
+    ----------
+    parameters : tuple of Parameter
+    values : dict
+        A value for each parameter, as the user gave it.
+
+    Returns
+    -------
+    dict
+        The same keys; built-in Python types only, and lists that are nobody else's.
+
     Raises
     ------
     FileNotFoundError

@@ -10,7 +10,6 @@ from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPE
 
 __all__ = ["Schedule", "band_noise", "solve"]
 
-STEP_BALANCE = 0.01  # κ, in units of the brightest pixel
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
 
 
@@ -41,6 +40,11 @@ class Schedule:
     reltol: float = 2e-4
     final_reltol: float = 1e-4
     interval: int = 30
+
+    @property
+    def expected_iterations(self) -> int:
+        """A guess of how many iterations it takes, for the progress."""
+        return min(self.niter, (self.nreweights + 4) * self.interval)
 
 
 def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
@@ -147,10 +151,7 @@ def _reweight(ppd, bounds, weight_sums, scale):
         ppd.l1_weights = ppd.dictionary.allocate()
     alpha = scale * band_noise(ppd, bounds.noise_weights, weight_sums)
     ppd.dictionary.reweight(ppd.model, np.maximum(alpha, 1e-30), ppd.l1_weights)
-    brightest = float(np.abs(ppd.model).max())
-    if brightest > 0:
-        ppd.rescale(STEP_BALANCE * brightest)
-        bounds.apply_to(ppd)
+    bounds.apply_to(ppd)
 
 
 def _relative(model, previous):

@@ -43,7 +43,7 @@ PARAMETERS = (
     Parameter('l2bound', ('doubleVec',), [], 'Noise level of each block, as a multiple of what the weights say', minimum=0.0, opener='databound', open_on=('fixed',)),
     Parameter('nreweights', ('int',), 20, 'Maximum number of re-weightings', minimum=0.0),
     Parameter('reweightdecay', ('double',), 0.618, 'Factor on the scale of the sparsity weights at each re-weighting', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
-    Parameter('reweighttol', ('double',), 0.005, 'Relative change of the model between re-weightings that ends them', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
+    Parameter('reweighttol', ('double',), 0.01, 'Relative change of the model between re-weightings that ends them', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
     Parameter('reltol', ('double',), 0.0002, 'Relative change of the model in one iteration that counts as converged', minimum=0.0, maximum=1.0),
     Parameter('finalreltol', ('double',), 0.0001, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic soft threshold', minimum=0.0),
@@ -306,7 +306,7 @@ class _tsara:
         The scale that separates penalised from freed coefficients shrinks by this factor each
         time. (omega of the paper.)
 
-    reweighttol : float, default 0.005
+    reweighttol : float, default 0.01
         Opened by nreweights = other than 0.
         Re-weighting ends when one more changes the model by less than this, relatively. (The
         varrho of the paper.)
@@ -390,7 +390,7 @@ class _tsara:
         uvtaper=[], restoration=True, restoringbeam=[], niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
         precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
-        l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.005, reltol=0.0002, finalreltol=0.0001,
+        l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0002, finalreltol=0.0001,
         regscale=1.0, blocks=0, nthreads=0, fullsummary=False, restart=False, overwrite=False, savemodel='none',
         parallel=False,
     ):

@@ -1,0 +1,115 @@
+"""The story of one image: read, weigh, split, solve, write."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.casa import log
+from casa_sara.casa.imageplane import define_image_plane
+from casa_sara.casa.images import read_model
+from casa_sara.casa.modelcolumn import write_model_column
+from casa_sara.casa.ms import read_visibilities
+from casa_sara.casa.products import write_products
+from casa_sara.casa.restore import fit_beam
+from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
+from casa_sara.interrupt import stop_on_interrupt
+from casa_sara.noise import noise_from_differences
+from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
+from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
+from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sort_into_blocks
+
+__all__ = ["Result", "make_image"]
+
+IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
+
+
+@dataclass
+class Result:
+    """What one run found, for the return value of the task.
+
+    `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
+    from the data, in units of what the weights say.
+    """
+
+    data: Visibilities
+    blocks: list[BlockInfo]
+    noise: np.ndarray
+    reconstruction: Reconstruction | None
+    residual_peak: float
+    model_flux: float
+
+
+def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
+               output: Output) -> Result:
+    """Image a selection of MeasurementSets and write the products.
+
+    Raises
+    ------
+    ValueError, FileNotFoundError, RuntimeError
+        For data or parameters that no image can be made of; the message names the task parameter.
+    """
+    # read
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    for note in data.notes:
+        log.warn(note)
+    plane = define_image_plane(data, selection, grid)
+    start = read_model(output.startmodel, plane) if output.startmodel else None
+    # split and weigh
+    block_of_sample, blocks = snapshot_blocks(data, output.blocks)
+    data, offsets = sort_into_blocks(data, block_of_sample)
+    noise = noise_from_differences(data, offsets)
+    _describe(data, blocks, noise)
+    # solve
+    operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
+    reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
+    if options.niter > 0:
+        density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
+        reconstruction = _solve(data, offsets, density, grid, options, noise, start)
+        model = reconstruction.model
+    # write
+    weights = imaging_weights(data, grid, weighting)
+    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
+    residual = dirty_image(operator, data.vis - operator.forward(model), weights)
+    images = dict(psf=psf, residual=residual, model=model)
+    write_products(output.imagename, plane, images, sum_of_weights(data, selection, weights), fit_beam(psf, plane),
+                   output.restoringbeam, output.history)
+    if output.savemodel == "modelcolumn":
+        log.info("writing the model column")
+        write_model_column(selection, data.phase_center, lambda uvw: MeasurementOperator(
+            uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads).forward(model))
+    return Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
+
+
+def _solve(data, offsets, density, grid, options, noise, start):
+    """Reconstruct, with progress in the log and Ctrl-C as the wish to stop."""
+    progress = log.Progress()
+    expected = schedule_of(options).expected_iterations
+
+    def report(ppd, record):
+        fraction = min(ppd.iteration / expected, 0.999)
+        progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
+                 f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
+
+    with stop_on_interrupt() as stopped:
+        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped)
+    progress.close()
+    record = reconstruction.record
+    log.info(f"{record.stop_description} after {record.iteration[-1]} iterations and {record.reweighting[-1]} re-weightings")
+    for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
+        log.info(f"block {j}: l2 bound {bound:.5g}, residual {norm:.5g} (whitened)")
+    return reconstruction
+
+
+def _describe(data, blocks, noise):
+    """Say in the log what was read."""
+    log.info(f"{data.size} Stokes I visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
+             f"{len(blocks)} blocks")
+    for reason, count in data.dropped.items():
+        log.info(f"left out: {count} samples, {reason}")
+    for j, (block, level) in enumerate(zip(blocks, noise)):
+        measured = f"noise measured from the data {level:.3g} times what the weights say" if np.isfinite(level) \
+            else "too few integrations to measure the noise"
+        log.info(f"block {j}: {block.label}; {measured}")

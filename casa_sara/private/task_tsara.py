@@ -1,0 +1,98 @@
+"""The task tsara: what the user asked for, checked and handed to the imaging."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import casa_sara
+from casa_sara.casa import log
+from casa_sara.casa.modelcolumn import check_model_column_writable
+from casa_sara.casa.products import check_imagename, existing_products, history_lines
+from casa_sara.casa.quantities import radians
+from casa_sara.casa.restore import restoring_beam_words
+from casa_sara.imaging import make_image
+from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
+from casa_sara.private.summary import summary
+from casa_sara.resources import available_cores
+
+__all__ = ["tsara"]
+
+ARCSEC = math.pi / 180 / 3600
+
+
+def tsara(**parameters: Any) -> dict[str, Any]:
+    """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
+    log.info(f"casa_sara {casa_sara.__version__}")
+    selection = _selection(parameters)
+    grid = _grid(parameters)
+    weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
+                          tuple(parameters["uvtaper"]))
+    options = _solver_options(parameters)
+    output = _output(parameters, grid)
+    if output.savemodel == "modelcolumn":
+        check_model_column_writable(selection)
+    result = make_image(selection, grid, weighting, options, output)
+    return summary(result, options, parameters["fullsummary"])
+
+
+def _selection(parameters):
+    vis = parameters["vis"]
+    vis = (vis,) if isinstance(vis, str) else tuple(vis)
+    chosen = {name: parameters[name] for name in Selection.PARAMETERS}
+    chosen = {name: value if isinstance(value, str) else tuple(value) for name, value in chosen.items()}
+    return Selection(vis, datacolumn=parameters["datacolumn"], **chosen)
+
+
+def _grid(parameters):
+    shape = _pair(parameters["imsize"], "imsize", "one number of pixels, or two")
+    cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
+    return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
+                     parameters["stokes"], parameters["reffreq"])
+
+
+def _pair(value, name, right):
+    values = list(value) if isinstance(value, (list, tuple)) else [value]
+    if len(values) not in (1, 2):
+        raise ValueError(f"{name} = {value!r}: should be {right}")
+    return values * 2 if len(values) == 1 else values
+
+
+def _cell_rad(value):
+    """One pixel size in radians; a number without unit is in arcsec, as in tclean."""
+    try:
+        size = float(value) * ARCSEC
+    except ValueError:
+        size = radians(value, "cell")
+    if not 0 < size < 1:
+        raise ValueError(f"cell = {value!r}: should be a positive angle, e.g. '0.1arcsec'")
+    return size
+
+
+def _solver_options(parameters):
+    if parameters["databound"] == "fixed" and not (parameters["l2bound"] and min(parameters["l2bound"]) > 0):
+        raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
+                         "blocks or one for each, in units of what the weights say")
+    names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}
+    values = {name: tuple(value) if isinstance(value := parameters[name], list) else value for name in names}
+    return SolverOptions(nthreads=parameters["nthreads"] or available_cores(), **values)
+
+
+def _output(parameters, grid):
+    imagename = parameters["imagename"]
+    startmodel = parameters["startmodel"]
+    check_imagename(imagename, grid.shape)
+    old = existing_products(imagename)
+    if parameters["restart"]:
+        if startmodel:
+            raise ValueError(f"startmodel = '{startmodel}' and restart = True both give the first model: set only one")
+        startmodel = imagename + ".model"
+        if startmodel not in old:
+            raise FileNotFoundError(f"restart = True continues from '{startmodel}', which does not exist: "
+                                    "set restart = False, or give startmodel")
+    elif old and not parameters["overwrite"]:
+        raise FileExistsError(f"imagename = '{imagename}': {', '.join(old)} exist; choose another name, "
+                              "overwrite = True to replace them, or restart = True to continue from the model")
+    beam = tuple(restoring_beam_words(parameters["restoringbeam"])) if parameters["restoration"] else None
+    return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"],
+                  tuple(history_lines("tsara", parameters)))
