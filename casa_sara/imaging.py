@@ -62,19 +62,20 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise = noise_from_differences(data, offsets)
     _describe(data, blocks, noise)
-    # solve
+    weights = imaging_weights(data, grid, weighting)
     operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
+    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
+    beam = fit_beam(psf, plane)
+    # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
         density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
         reconstruction = _solve(data, offsets, density, grid, options, noise, start)
         model = reconstruction.model
     # write
-    weights = imaging_weights(data, grid, weighting)
-    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
     residual = dirty_image(operator, data.vis - operator.forward(model), weights)
     images = dict(psf=psf, residual=residual, model=model)
-    write_products(output.imagename, plane, images, sum_of_weights(data, selection, weights), fit_beam(psf, plane),
+    write_products(output.imagename, plane, images, sum_of_weights(data, selection, weights), beam,
                    output.restoringbeam, output.history)
     if output.savemodel == "modelcolumn":
         log.info("writing the model column")

@@ -81,8 +81,8 @@ class SolverOptions:
     nreweights: int = 20
     reweightdecay: float = 0.618
     reweighttol: float = 1e-2
-    reltol: float = 2e-4
-    finalreltol: float = 1e-4
+    reltol: float = 3e-4
+    finalreltol: float = 3e-4
     regscale: float = 1.0
     nthreads: int = 1
 

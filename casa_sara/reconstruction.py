@@ -17,7 +17,7 @@ from casa_sara.solver.reweighting import Schedule, solve
 
 __all__ = ["Reconstruction", "reconstruct", "schedule_of"]
 
-STEP_BALANCE = 0.05  # κ in units of the mean brightness Σx²/Σx of the NNLS image
+STEP_BALANCE = 0.05  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
@@ -36,7 +36,7 @@ class Reconstruction:
         μ_j of the NNLS image, from which adaptive bounds start.
     record : SolverRecord
     data_norm_sq : float
-        ‖U^½Φ‖², whitened.
+        ‖U^½Φ‖², whitened, 1/Jy².
     threshold : float
         Last κ, Jy/pixel.
     noise_jy_per_beam : float
@@ -78,8 +78,14 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     -------
     Reconstruction
     """
+    if options.databound == "fixed" and len(options.l2bound) not in (1, len(offsets) - 1):
+        raise ValueError(f"l2bound = {list(options.l2bound)}: there are {len(offsets) - 1} blocks; give one noise level "
+                         "for all of them, or one for each")
+    # whitened samples, and images in units of the noise of one sample: every number is near 1
+    unit_jy = float(np.mean(data.weight, dtype=float) ** -0.5)
     sqrt_weight = np.sqrt(data.weight)
     vis = data.vis * sqrt_weight
+    sqrt_weight *= np.float32(unit_jy)
     measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight,
                                       nthreads=options.nthreads)
     dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
@@ -88,23 +94,26 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
                                 grid.shape, dtype=np.float32)
 
     ppd = AdaptivePPD(measurement, dictionary, vis, offsets, precond, data_norm_sq, options.positivity)
+    ppd.unit_jy = unit_jy
     samples = np.diff(offsets)
-    weight_sums = np.add.reduceat(data.weight.astype(float), offsets[:-1])
-    # positivity alone: where the bounds start, and how bright the image is
-    nnls_model, nnls_residual = nnls(measurement, vis, precond, data_norm_sq, positivity=options.positivity)
-    nnls_norms = np.array([np.linalg.norm(nnls_residual[a:b]) for a, b in ppd.blocks()])
+    weight_sums = np.add.reduceat(data.weight.astype(float), offsets[:-1]) * unit_jy**2
+    # positivity and a vanishing sparsity alone: where the bounds start, and the model too
+    first, residual = nnls(measurement, vis, precond, data_norm_sq, positivity=options.positivity)
+    nnls_norms = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
     bounds = _bounds(ppd, nnls_norms, samples, weight_sums, noise, options)
     noise_only = _is_noise_only(ppd, bounds, weight_sums)
-    ppd.rescale(STEP_BALANCE * _mean_brightness(nnls_model if startmodel is None else startmodel))
     if startmodel is not None:
-        ppd.start_from(startmodel)
+        first = startmodel / np.float32(unit_jy)
+    ppd.start_from(first)
+    ppd.rescale(STEP_BALANCE * _mean_brightness(first))
 
     record = solve(ppd, bounds, weight_sums, schedule_of(options), progress, stopped)
     if record.stop_code == CONVERGED and noise_only:
         record.stop_code = NOISE_ONLY
-    return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms,
-                          nnls_norms, record, data_norm_sq,
-                          ppd.threshold, float(np.sum(weight_sums * bounds.noise_weights) ** -0.5))
+    ppd.model *= np.float32(unit_jy)
+    noise_jy_per_beam = unit_jy * float(np.sum(weight_sums * bounds.noise_weights) ** -0.5)
+    return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms, nnls_norms, record,
+                          data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam)
 
 
 def schedule_of(options):
@@ -122,16 +131,17 @@ def _preconditioner(density, wanted):
 
 
 def _bounds(ppd, nnls_norms, samples, weight_sums, noise, options):
+    common = dict(samples=samples, weight_sums=weight_sums, n_bases=ppd.dictionary.n_bases, regscale=options.regscale)
     if options.databound == "weights":
-        return GivenBounds(chi_square_bounds(samples))
+        return GivenBounds(chi_square_bounds(samples), **common)
     if options.databound == "fixed":
-        return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)))
+        return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)), **common)
     # never below the noise that the data show
     floor = ppd.residual_norms / DYNAMIC_RANGE
     if noise is not None:
         floor = np.fmax(floor, np.asarray(noise) * np.sqrt(2.0 * samples))
-    return AdaptiveBounds(nnls_norms, samples, weight_sums, ppd.dictionary.n_bases, floor, options.regscale,
-                          options.boundrelchange, options.boundtol, options.boundstep, options.boundinterval)
+    return AdaptiveBounds(nnls_norms, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
+                          step=options.boundstep, min_interval=options.boundinterval)
 
 
 def _is_noise_only(ppd, bounds, weight_sums):
@@ -142,6 +152,6 @@ def _is_noise_only(ppd, bounds, weight_sums):
 
 
 def _mean_brightness(model):
-    """Mean brightness of the flux, Σx²/Σ|x|, Jy/pixel; 1 for an empty image."""
+    """Mean brightness of the flux, Σx²/Σ|x|; 1 for an empty image."""
     flux = np.abs(model).sum(dtype=float)
     return float(np.square(model, dtype=float).sum() / flux) if flux > 0 else 1.0

@@ -26,7 +26,12 @@ ROOMS = {
     "__init__": {"casa_sara.tasks"},
     "tasks": {"casa_sara.private"},
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
-    "private": {"casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.casa", "casashell", *CASA},
+    "private": {
+        "casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.resources", "casa_sara.solver",
+        "casa_sara.casa", "numpy", "casashell", *CASA,
+    },
+    "interrupt": set(),
+    "resources": set(),
     "options": set(),
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
@@ -40,7 +45,7 @@ ROOMS = {
 LIBRARY = ("options", "visibilities", "noise", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["imaging"] = {"casa_sara.casa", "numpy", *NUMERICS}
+ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
 ROOMS["demo"] = {"casa_sara", "casa_sara.casa", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS, *CASA}
 
 

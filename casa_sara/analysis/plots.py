@@ -129,7 +129,7 @@ def _panel(panel, column, kind, cell, norm) -> None:
     elif column.residual is not None:
         _draw(panel, column.residual, 1e3, cell, norm)
         ground = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5}
-        text = f"residual, rms {1e3 * np.nanstd(column.residual):.2g} mJy/beam"
+        text = f"residual, rms {1e3 * np.nanstd(column.residual):.3g} mJy/beam"
         panel.text(0.02, 0.96, text, bbox=ground, **place)
         _beam(panel, column.beam, "black")
     else:
@@ -150,7 +150,8 @@ def _draw(panel, image, scale, cell, norm) -> None:
 def _frame(panel, zoom) -> None:
     """Cut a panel to the zoom and give it a scale bar."""
     half = zoom.side / 2
-    panel.set(xlim=(zoom.east + half, zoom.east - half), ylim=(zoom.north - half, zoom.north + half), xticks=[], yticks=[])
+    panel.set(xlim=(zoom.east + half, zoom.east - half), ylim=(zoom.north - half, zoom.north + half))
+    panel.set(xticks=[], yticks=[])
     panel.spines[:].set_color(LINE)
     panel.text(0.04, 0.95, zoom.name, color="white", va="top", transform=panel.transAxes, **TEXT)
     unit = 10 ** np.floor(np.log10(half))
@@ -179,7 +180,10 @@ def _label_axes(panel, first, last) -> None:
     """Write offsets in arcsec along the outer edges only."""
     panel.tick_params(labelsize=8, color=LINE, direction="in", labelleft=first, labelbottom=last)
     for axis in (panel.xaxis, panel.yaxis):
-        axis.set_major_locator(MaxNLocator(7, steps=[1, 2, 5, 10], prune="both"))
+        low, high = sorted(axis.get_view_interval())
+        ticks = MaxNLocator(7, steps=[1, 2, 5, 10]).tick_values(low, high)
+        room = 0.04 * (high - low)  # or the labels of neighbours would touch
+        axis.set_ticks(ticks[(ticks > low + room) & (ticks < high - room)])
     if first:
         panel.set_ylabel("north [arcsec]", **TEXT)
     if last:

@@ -30,7 +30,7 @@ class ImagePlane:
     csys : dict
         Record of the coordinate system: right ascension, declination, Stokes, frequency.
     pb : float32 (nx, ny)
-        Primary beam, 1 at its peak, 0 below `PB_LIMIT`.
+        Primary beam, at most 1, and 0 below `PB_LIMIT`.
     mask : bool (nx, ny)
         Good pixels, where the primary beam is above `PB_LIMIT`.
     imageinfo : dict
@@ -79,10 +79,13 @@ def define_image_plane(visibilities, selection, grid):
         root = os.path.join(folder, "plane")
         _make_primary_beam(visibilities, selection, grid, root)
         with opened("image", root + ".pb") as ia:
-            pb, mask = read_pixels(ia), read_pixels(ia, getmask=True)
+            pb = read_pixels(ia)
             csys, miscinfo = ia.coordsys().torecord(), ia.miscinfo()
         with opened("table", root + ".pb") as tb:
             imageinfo = tb.getkeyword("imageinfo")
+    pb /= max(pb.max(), np.float32(1))  # above 1 where several fields are imaged together
+    mask = pb > PB_LIMIT
+    pb[~mask] = 0
     kept = {key: miscinfo[key] for key in ("INSTRUME", "distance") if key in miscinfo}
     return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept)
 
@@ -105,10 +108,14 @@ def slabs(nx, ny):
 
 
 def _make_primary_beam(visibilities, selection, grid, root):
-    """Write the image `root`.pb with synthesisimager, as tclean does."""
+    """Write the image `root`.pb, not normalised yet, with synthesisimager.
+
+    Its partner synthesisnormalizer would do that, but now and then the two tools overwrite
+    each other's pixels.
+    """
     import casatools
 
-    imager, normalizer = casatools.synthesisimager(), casatools.synthesisnormalizer()
+    imager = casatools.synthesisimager()
     try:
         for number in _by_start(visibilities):
             imager.selectdata(_selection_record(selection, number))
@@ -118,12 +125,8 @@ def _make_primary_beam(visibilities, selection, grid, root):
             parameters = f"imsize = {list(grid.shape)}, projection = '{grid.projection}', reffreq = '{grid.reffreq}'"
             raise ValueError(f"{parameters}: CASA makes no image of them: {str(error).strip()}") from error
         imager.makepb()
-        imager.done()  # else it may write its own pixels over the normalised ones
-        normalizer.setupnormalizer({"imagename": root, "pblimit": PB_LIMIT, "nterms": 1, "normtype": "flatnoise"})
-        normalizer.normalizeprimarybeam()
     finally:
         imager.done()
-        normalizer.done()
 
 
 def _by_start(visibilities):

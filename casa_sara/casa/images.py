@@ -98,14 +98,26 @@ class _PixelMap:
 
         self._from, self._to = csys, casatools.coordsys()
         self._to.fromrecord(plane.csys)
-        self._from.setconversiontype(direction=self._to.referencecode("direction")[0])
-        self._rest = [np.asarray(c.referencepixel()["numeric"], float)[2:] for c in (self._from, self._to)]
-        self._values = np.asarray(self._to.referencevalue(format="n")["numeric"], float)[2:]
+        self._rest = np.asarray(csys.referencepixel()["numeric"])[2:]
+        self._values = np.asarray(self._to.referencevalue()["numeric"])[2:]
+        self._turn_to(self._to.referencecode("direction")[0], plane.csys["obsdate"])
+
+    def _turn_to(self, frame, date):
+        """Convert directions to this frame; coordsys does it without the date, which moves B1950 by 0.1 arcsec."""
+        import casatools
+
+        me, center = casatools.measures(), self._from.referencevalue("m")["measure"]["direction"]
+        me.doframe(date)
+        exact = me.measure(center, frame)
+        self._from.setconversiontype(direction=frame)
+        found = self._from.toworld(self._from.referencepixel()["numeric"])["numeric"][:2]
+        shift = np.array([exact["m0"]["value"], exact["m1"]["value"]]) - found
+        self._shift = np.array([np.remainder(shift[0] + np.pi, 2 * np.pi) - np.pi, shift[1]])[:, None]
 
     def __call__(self, x, y):
         """Return the pixel coordinates (2, N) of the pixel coordinates x, y (N,)."""
-        pixels = np.vstack([x, y, *(np.full(x.size, rest) for rest in self._rest[0])])
-        sky = self._from.toworldmany(pixels)["numeric"][:2]
+        pixels = np.vstack([x, y, *(np.full(x.size, rest) for rest in self._rest)])
+        sky = self._from.toworldmany(pixels)["numeric"][:2] + self._shift
         world = np.vstack([sky, *(np.full(x.size, value) for value in self._values)])
         return self._to.topixelmany(world)["numeric"][:2]
 

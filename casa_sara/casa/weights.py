@@ -2,10 +2,11 @@
 
 Both count the summed natural weight of the samples in each cell of the uv plane, of side
 1/(n·cell) for an image of n pixels; a sample counts at (u, v) and at (−u, −v). The index of
-a cell is trunc(n·cell·u + n//2) in single precision; index 0 and what lies beyond the grid
-are left out. tclean takes −u for u, LSRK frequencies and the image's size in each axis;
+a cell is trunc(n·cell·u + n//2) in single precision, where u is in metres times the rounded
+wave number; index 0 and what lies beyond the grid are left out. tclean takes −u for u, LSRK frequencies and the image's size in each axis;
 imager takes the frequencies of the data and one size for both axes. Neither turns the
-baselines to the phase centre of the image before it counts.
+baselines to the phase centre of the image before it counts. Both also count what they do not
+image, autocorrelations and rows flagged by FLAG_ROW alone; here these are left out.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def sampling_density(visibilities, selection, grid):
     for number in visibilities.spws:
         density += _imager_grid(visibilities.ms_names[number], selection.of(number), side, cell)[cells]
     weight = visibilities.imaging_weight
-    bad = ~(density >= 0.5 * weight)
+    bad = ~((density >= 0.5 * weight) & np.isfinite(density))
     if bad.any():
         opposite = _cells(-u, -v, (side, side), (cell, cell))
         density[bad] = _count(cells, opposite, weight, side * side)[cells[bad]]
@@ -171,6 +172,7 @@ def _field_uv(visibilities, frame):
         lengths = np.sqrt(np.square(uvw_m).sum(axis=0))
         wave_numbers = np.sqrt(np.einsum("xm,xm->m", visibilities.uvw, visibilities.uvw))
         wave_numbers /= np.maximum(lengths, np.finfo(float).tiny)[visibilities.row]
+    wave_numbers = wave_numbers.astype(np.float32)
     return tuple((uvw_m[axis, visibilities.row] * wave_numbers).astype(np.float32) for axis in (0, 1))
 
 

@@ -25,14 +25,14 @@ TCLEAN_WEIGHTINGS = {"tclean Briggs −1": ("briggs", -1.0), "tclean natural": (
 class Case:
     """One set of data and how it is imaged.
 
-    `clean` holds the parameters of tclean that depend on the source: scales, niter …
+    `clean` holds the parameters of tclean that depend on the source (scales, niter …), for each weighting.
     """
 
     folder: Path
     vis: list[str]
     imsize: list[int]
     cell_arcsec: float
-    clean: dict = field(default_factory=dict)
+    clean: dict[str, dict] = field(default_factory=dict)
 
     def common(self, imagename: str) -> dict:
         """Return the parameters that tsara and tclean share."""
@@ -73,7 +73,7 @@ def run_tcleans(case: Case) -> list[Product]:
     os.environ["OMP_NUM_THREADS"] = "1"  # a second thread costs the multiscale minor cycle more than it brings
     try:
         with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
-            made = list(pool.map(_tclean, [case] * 2, range(2), TCLEAN_WEIGHTINGS.values()))
+            made = list(pool.map(_tclean, [case] * 2, TCLEAN_WEIGHTINGS.values()))
     finally:
         del os.environ["OMP_NUM_THREADS"]
         if threads is not None:
@@ -81,16 +81,15 @@ def run_tcleans(case: Case) -> list[Product]:
     return [_product(name, *result) for name, result in zip(TCLEAN_WEIGHTINGS, made)]
 
 
-def _tclean(case: Case, number: int, weighting) -> tuple[Path, int, float, float]:
+def _tclean(case: Case, weighting: tuple[str, float]) -> tuple[Path, int, float, float]:
     """Run tclean in a process of its own; return the images' path, iterations, wall and CPU seconds."""
     root = case.folder / f"tclean_{weighting[0]}"
     with quiet(root.with_suffix(".txt")):
         from casatasks import tclean
 
         wall, cpu = time.perf_counter(), time.process_time()
-        made = tclean(
-            **case.common(root.name), deconvolver="multiscale", weighting=weighting[0], robust=weighting[1], **case.clean
-        )
+        chosen = {"weighting": weighting[0], "robust": weighting[1], **case.clean[weighting[0]]}
+        made = tclean(**case.common(root.name), deconvolver="multiscale", **chosen)
         return root, made["iterdone"], time.perf_counter() - wall, time.process_time() - cpu
 
 

@@ -10,13 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import finufft
 import numpy as np
 from casatools import ctsys, measures, simulator, table
 
+from casa_sara.demo.predict import predict
 from casa_sara.demo.sky import ARCSEC, Sky
 
-__all__ = ["Observation", "Block", "Simulation", "simulate_observation", "predict"]
+__all__ = ["Observation", "Block", "Simulation", "simulate_observation"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 
@@ -151,7 +151,7 @@ def simulate_observation(
     cell = sky.cell_rad * sky.oversampling / ARCSEC
     simulation = Simulation([str(rows.vis) for rows in observed], sky.truth(), cell, observation.phasecenter)
     for number, rows in enumerate(observed):
-        simulation.noise_std.append(std * noise_scale[number])
+        simulation.noise_std.append(float(std * noise_scale[number]))
         simulation.blocks += rows.corrupt(simulation.noise_std[-1], weight_scale[number], gain_rms, [seed, number])
     return simulation
 
@@ -201,55 +201,15 @@ class _Rows:
         return blocks
 
 
-def predict(sky: Sky, uvw: np.ndarray) -> np.ndarray:
-    """Predict the visibilities of a sky, V = Σ I exp(2πi [u l + v m + w (n − 1)]).
-
-    The term in w is expanded in its Taylor series, one NUFFT for each power, until what is left is
-    below 1e-9 of the total flux.
-
-    Parameters
-    ----------
-    sky : Sky
-    uvw : float64 (3, M)
-        Baselines in wavelengths.
-
-    Returns
-    -------
-    complex128 (M,)
-        Visibilities in Jy.
-    """
-    nx, ny = sky.image.shape
-    l = (np.arange(nx) - nx // 2)[:, None] * sky.cell_rad
-    m = (np.arange(ny) - ny // 2)[None, :] * sky.cell_rad
-    n_minus_1 = np.sqrt(1 - l**2 - m**2) - 1
-    u, v, w = uvw
-    x, y = -2 * np.pi * sky.cell_rad * u, 2 * np.pi * sky.cell_rad * v
-    largest = 2 * np.pi * np.abs(w).max() * np.abs(n_minus_1).max()
-
-    vis = np.zeros(u.size, complex)
-    image, factor, bound, power = sky.image.astype(complex), np.ones(u.size, complex), 1.0, 0
-    while bound > 1e-9:
-        vis += factor * finufft.nufft2d2(x, y, image, isign=1, eps=1e-12)
-        power += 1
-        image = image * n_minus_1
-        factor = factor * 2j * np.pi * w / power
-        bound *= largest / power
-    for l, m, flux in sky.points:
-        vis += flux * np.exp(2j * np.pi * (u * l + v * m + w * (np.sqrt(1 - l**2 - m**2) - 1)))
-    return vis
-
-
 def _lay_out(vis: Path, config: str, phases: np.ndarray, observation: Observation) -> None:
     """Write a MeasurementSet without signal; its scans start at `phases` (0 … 1) of the range of hour angles."""
-    antennas = ctsys.resolve(observation.antenna_file.format(config.lower()))
-    x, y, z, diameter = np.loadtxt(antennas, usecols=(0, 1, 2, 3), unpack=True)
-    names = [f"{config}{number:03d}" for number in range(x.size)]
+    (x, y, z, diameter), names, system = _antennas(ctsys.resolve(observation.antenna_file.format(config.lower())))
     me, sm = measures(), simulator()
     sm.open(str(vis))
     try:
         sm.setconfig(
             telescopename=observation.telescope, x=x, y=y, z=z, dishdiameter=diameter, mount=["alt-az"],
-            antname=names, coordsystem="global", referencelocation=me.observatory(observation.telescope),
+            antname=names, coordsystem=system, referencelocation=me.observatory(observation.telescope),
         )  # fmt: skip
         width = f"{observation.channel_hz}Hz"
         sm.setspwindow(
@@ -269,3 +229,12 @@ def _lay_out(vis: Path, config: str, phases: np.ndarray, observation: Observatio
             sm.observe(observation.source, "band", starttime=f"{start}s", stoptime=f"{stop}s")
     finally:
         sm.close()
+
+
+def _antennas(path: str) -> tuple[np.ndarray, list[str], str]:
+    """Read a CASA antenna file: x, y, z and diameter in m (4, n), pad names, and the system of the coordinates."""
+    lines = Path(path).read_text().splitlines()
+    rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
+    names = [row[4] if len(row) > 4 else f"A{number:03d}" for number, row in enumerate(rows)]
+    system = "local" if any(line.startswith("#") and "coordsys=LOC" in line for line in lines) else "global"
+    return np.array([row[:4] for row in rows], float).T, names, system

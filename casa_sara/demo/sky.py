@@ -17,7 +17,7 @@ ARCSEC = np.pi / 180 / 3600
 COMPANION_JY = 5e-3
 
 TOTAL_JY = 12.0
-CORE_JY = 0.3
+CORE_JY = 0.1
 COMPANION_OFFSET = (-0.33, -0.226)  # arcsec (east, north) of the core: 0.4 arcsec away
 CORE_FWHM = 0.1  # arcsec
 LENGTH = 12.6  # arcsec: from the core to the head of a lobe
@@ -60,13 +60,15 @@ class Sky:
         """Return what an image at the coarse cell should show, float64 (nx/k, ny/k) in Jy/pixel.
 
         The brightness at the coarse pixels' centres times their area, which a band-limited
-        sky and its samples have in common. Point sources fall into the nearest pixel.
+        sky and its samples have in common. Point sources fall into the nearest pixel, if the image has it.
         """
         k = self.oversampling
         truth = self.image[::k, ::k] * k**2
         nx, ny = truth.shape
         for l, m, flux in self.points:
-            truth[round(nx // 2 - l / (k * self.cell_rad)), round(ny // 2 + m / (k * self.cell_rad))] += flux
+            ix, iy = round(nx // 2 - l / (k * self.cell_rad)), round(ny // 2 + m / (k * self.cell_rad))
+            if 0 <= ix < nx and 0 <= iy < ny:
+                truth[ix, iy] += flux
         return truth
 
 
@@ -74,7 +76,7 @@ def cyg_a_like(shape=(512, 256), cell_arcsec=0.06, oversampling=2, seed=1405) ->
     """Build the demo's radio galaxy.
 
     Two lobes of filaments with bright rims, two hotspots in each, a jet with knots, a core of
-    0.3 Jy that is barely resolved and a point source of 5 mJy, 0.4 arcsec from the core and
+    0.1 Jy that is barely resolved and a point source of 5 mJy, 0.4 arcsec from the core and
     off the pixels' centres. Total flux 12 Jy.
 
     Parameters

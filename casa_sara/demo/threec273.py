@@ -18,7 +18,7 @@ IMSIZE = 192
 CELL_ARCSEC = 0.5
 CLEAN = {
     "scales": [0, 3, 9, 18], "gain": 0.2, "niter": 2000, "nsigma": 2.0,
-    "usemask": "user", "mask": "circle[[96pix, 96pix], 60pix]",
+    "usemask": "user", "mask": f"circle[[{IMSIZE // 2}pix, {IMSIZE // 2}pix], 60pix]",
 }  # fmt: skip
 
 
@@ -30,7 +30,7 @@ def run(folder: Path) -> None:
         from casatasks import importuvfits
 
         importuvfits(fitsfile=ctsys.resolve("demo/3C273XC1.fits"), vis=vis)
-    case = Case(folder, [vis], [IMSIZE, IMSIZE], CELL_ARCSEC, CLEAN)
+    case = Case(folder, [vis], [IMSIZE, IMSIZE], CELL_ARCSEC, {"briggs": CLEAN, "natural": CLEAN})
     print("  tclean multiscale, Briggs −1 and natural, side by side …", flush=True)
     cleaned = run_tcleans(case)
     print("  tsara …", flush=True)

@@ -14,7 +14,8 @@ from numba.core import types
 from numba.core.datamodel import models
 from numba.extending import intrinsic, register_model
 
-__all__ = ["element", "load", "multiply", "multiply_add", "pair_sums", "polynomials", "scale_pairs", "store"]
+__all__ = ["gather_rows", "load", "multiply", "multiply_add", "pair_sums", "polynomials", "scale_pairs", "scatter_rows",
+           "store", "zeros"]
 
 INT = ir.IntType(32)
 
@@ -68,6 +69,17 @@ def load(typing_context, array, index, count):
 
 
 @intrinsic
+def zeros(typing_context, array, count):
+    """len(count) zeros of the type of a 1-D array."""
+    lanes = Lanes(array.dtype, len(count))
+
+    def codegen(context, builder, signature, args):
+        return ir.Constant(context.get_value_type(lanes), None)
+
+    return lanes(array, count), codegen
+
+
+@intrinsic
 def store(typing_context, array, index, lanes):
     """Write lanes to consecutive elements of a contiguous 1-D array from `index` on."""
 
@@ -102,12 +114,6 @@ def scale_pairs(typing_context, lanes, even, odd):
 
 
 @intrinsic
-def element(typing_context, lanes, lane):
-    """The number in one lane."""
-    return lanes.scalar(lanes, types.intp), lambda context, builder, signature, args: builder.extract_element(*args)
-
-
-@intrinsic
 def pair_sums(typing_context, lanes):
     """(sum of the even lanes, sum of the odd lanes); the number of lanes is a power of two."""
     pair = types.UniTuple(lanes.scalar, 2)
@@ -136,3 +142,39 @@ def polynomials(typing_context, coefs, t, terms, count):
         return functools.reduce(lambda value, row: _multiply_add(builder, value, args[1], row), rows)
 
     return lanes(coefs, coefs.dtype, terms, count), codegen
+
+
+def _rows(context, builder, array_type, args, lanes, width):
+    """Addresses of `width` rows, `stride` apart, from args = (array, first, stride, …)."""
+    array, index, stride = args[:3]
+    for _ in range(width):
+        yield _pointer(context, builder, array_type, array, index, lanes)
+        index = builder.add(index, stride)
+
+
+@intrinsic
+def gather_rows(typing_context, array, first, stride, factors, width):
+    """Σ_i factors[2i] · lanes at array[first + i·stride], i < len(width), of a contiguous 1-D array."""
+
+    def codegen(context, builder, signature, args):
+        total = ir.Constant(args[3].type, None)
+        for i, row in enumerate(_rows(context, builder, array, args, factors, len(width))):
+            factor = builder.extract_element(args[3], INT(2 * i))
+            total = _multiply_add(builder, builder.load(row, align=array.dtype.bitwidth // 8), factor, total)
+        return total
+
+    return factors(array, types.intp, types.intp, factors, width), codegen
+
+
+@intrinsic
+def scatter_rows(typing_context, array, first, stride, factors, lanes, width):
+    """Add factors[2i] · lanes to array[first + i·stride …], i < len(width): the transpose of `gather_rows`."""
+
+    def codegen(context, builder, signature, args):
+        align = array.dtype.bitwidth // 8
+        for i, row in enumerate(_rows(context, builder, array, args, factors, len(width))):
+            factor = builder.extract_element(args[3], INT(2 * i))
+            builder.store(_multiply_add(builder, args[4], factor, builder.load(row, align=align)), row, align=align)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.intp, factors, lanes, width), codegen

@@ -149,20 +149,23 @@ _overload(operator.mul, lambda builder, a, b: builder.fmul(a, b))
 _overload(operator.truediv, lambda builder, a, b: builder.fdiv(a, b))
 
 
-def filter_bank(lags, masked=False):
+def filter_bank(lags, along=False, masked=False):
     """Make the kernel of a bank of short filters, unrolled for every even length up to MAX_TAPS.
 
     The kernel is called as ``bank(lines, offsets, taps, length, lanes)`` and returns the tuple of vectors
 
-        sum[n · len(lags) + o] = Σ_{t < length} taps[o mod 2, t] · vector at (lines[t + lag_o] + offsets[n]),
+        sum[n · len(lags) + o] = Σ_{t < length} taps[o mod 2, t] · vector at (line(t + lag_o) + offsets[n]),
 
-    where `lines` is an int64 array of addresses, `offsets` a tuple of byte offsets and `taps` an array (2, ≥ length).
-    Every input vector is loaded once and every tap broadcast once.
+    where `offsets` is a tuple of byte offsets and `taps` an array (2, ≥ length).  Every input vector is loaded once
+    and every tap broadcast once.
 
     Parameters
     ----------
     lags : callable
         Number of taps to the tuple of lags of the outputs.
+    along : bool
+        Filter along two interleaved lines: line(p) = lines[p mod 2] + p // 2 values, `lines` a tuple of two
+        addresses.  Otherwise across lines: line(p) = lines[p], `lines` an int64 array of addresses.
     masked : bool
         Touch only the first `lanes` values of each line; without it `lanes` is ignored.
     """
@@ -172,7 +175,12 @@ def filter_bank(lags, masked=False):
         sums = types.UniTuple(vec, len(offsets) * len(lags(2)))
 
         def codegen(context, builder, sig, args):
-            address = context.make_array(lines)(context, builder, args[0]).data
+            if along:
+                pair = cgutils.unpack_tuple(builder, args[0])
+                line = lambda p: builder.add(pair[p % 2], ir.Constant(INT, p // 2 * vec.size))
+            else:
+                table = context.make_array(lines)(context, builder, args[0]).data
+                line = lambda p: builder.load(builder.gep(table, [ir.Constant(INT, p)]))
             tap = context.make_array(taps)(context, builder, args[2])
             row = builder.udiv(cgutils.unpack_tuple(builder, tap.strides)[0], ir.Constant(INT, vec.size))
             starts = [tap.data, builder.gep(tap.data, [row])]
@@ -185,8 +193,7 @@ def filter_bank(lags, masked=False):
                 if n < MAX_TAPS:
                     switch.add_case(ir.Constant(INT, n), block)
                 builder.position_at_end(block)
-                results.append(_unrolled(builder, vec, n, lags(n), address, starts, shifts,
-                                         args[4] if masked else None))
+                results.append(_unrolled(builder, vec, n, lags(n), line, starts, shifts, args[4] if masked else None))
                 builder.branch(done)
             builder.position_at_end(done)
             merged = [builder.phi(vec.llvm) for _ in range(len(sums))]
@@ -200,20 +207,22 @@ def filter_bank(lags, masked=False):
     return bank
 
 
-def _unrolled(builder, vec, length, lags, lines, taps, offsets, lanes):
-    """The sums of `filter_bank` for one filter length."""
+def _unrolled(builder, vec, length, lags, line, taps, offsets, lanes):
+    """The sums of `filter_bank` for one filter length, each rounded in the same way."""
+    multiply_add = cgutils.get_or_insert_function(
+        builder.module, ir.FunctionType(vec.llvm, 3 * [vec.llvm]), f"llvm.fmuladd.v{vec.width}f{8 * vec.size}")
     sums = [[None] * len(lags) for _ in offsets]
     factors = []
     for p in range(length + max(lags)):
-        index = [ir.Constant(INT, p)]
-        line = builder.load(builder.gep(lines, index))
+        address = line(p)
         if p < length:
+            index = [ir.Constant(INT, p)]
             factors.append([_splat(builder, builder.load(builder.gep(row, index)), vec.llvm) for row in taps])
         for n, offset in enumerate(offsets):
-            value = _move(builder, vec, builder.add(line, offset), lanes=lanes)
+            value = _move(builder, vec, builder.add(address, offset), lanes=lanes)
             for o, lag in enumerate(lags):
                 if 0 <= p - lag < length:
-                    term = builder.fmul(factors[p - lag][o % 2], value, flags=["contract"])
-                    old = sums[n][o]
-                    sums[n][o] = term if old is None else builder.fadd(term, old, flags=["contract"])
+                    factor = factors[p - lag][o % 2]
+                    sums[n][o] = builder.fmul(factor, value) if p == lag else \
+                        builder.call(multiply_add, [factor, value, sums[n][o]])
     return sum(sums, [])

@@ -18,13 +18,14 @@ import numpy as np
 from numba import njit
 
 from casa_sara.operators import kaiser_bessel
-from casa_sara.operators._gridding_vectors import load, multiply_add, store
+from casa_sara.operators._gridding_vectors import load, multiply_add, store, zeros
 
-__all__ = ["AxisDecimation", "Separable", "decimate", "expand", "expand_rows", "scratch_shape"]
+__all__ = ["AxisDecimation", "Separable", "decimate", "expand", "expand_rows", "scratch_shape", "separable"]
 
 FULLEST_BAND = 0.42
 LARGEST_FACTOR = 8
-WIDE, NARROW = (0,) * 64, (0,) * 8  # lengths of vectors
+WIDE, SINGLE = (0,) * 32, (0,)  # lengths of vectors
+GROUP = 4  # rows that are summed together
 
 
 class AxisDecimation:
@@ -113,21 +114,30 @@ def _windowed_sinc(half, reach, factor, eps, largest_gain):
 class Separable(NamedTuple):
     """One axis as the compiled kernels take it."""
 
-    taps: np.ndarray  # real (2·W,): real parts, then imaginary parts
+    taps: np.ndarray  # complex (W + 2·margin,), zeros in the margins
+    margin: int
     factor: int
     first: int  # pixel under the first tap of the first sample, ≤ 0
     cells: np.ndarray  # int64 (count,), where each sample goes in the grid
     gains: np.ndarray  # complex (count,), what it is multiplied with
 
 
+def separable(axis, size, cells, factors, dtype):
+    """`axis`, of `size` pixels, with its samples' cells and further factors, for arithmetic in complex `dtype`."""
+    margin = (GROUP - 1) * axis.factor
+    first = axis.factor * axis.start - axis.taps.size // 2 + size // 2
+    gains = factors * axis.modulation(axis.start + np.arange(axis.count))
+    return Separable(np.pad(axis.taps, margin).astype(dtype), margin, axis.factor, first, cells, gains.astype(dtype))
+
+
 def scratch_shape(columns, workers):
-    """Shape of the real work space of `decimate` and `expand`: rows of whole vectors, with a margin for shifts."""
-    margin = -(-columns.taps.size // 2 // columns.factor)
-    length = margin + -(-columns.cells.size // len(WIDE)) * len(WIDE)
-    return workers, columns.factor + 2, margin + length
+    """Shape of the real work space of `decimate` and `expand`."""
+    shifts = -(-(columns.taps.size - 2 * columns.margin) // columns.factor)
+    vectors = -(-(columns.cells.size + shifts) // len(WIDE))
+    return workers, columns.factor + 2, shifts + vectors * len(WIDE)
 
 
-_jit = njit(nogil=True, cache=True, fastmath={"contract"})
+_jit = njit(nogil=True, cache=True)
 
 
 @_jit
@@ -137,80 +147,78 @@ def decimate(image, rows, columns, grid, lines, scratch, worker, workers):
     `lines` real (rows.cells.size, ny) receives the image decimated along its first axis only, by
     real taps.  `scratch` has the shape `scratch_shape`.
     """
-    nx, ny = image.shape
-    n_taps, count = rows.taps.size // 2, columns.cells.size
+    n_taps = rows.taps.size - 2 * rows.margin
+    begin, end = rows.cells.size * worker // workers, rows.cells.size * (worker + 1) // workers
     phases, sums = scratch[worker, :-2], scratch[worker, -2:]
-    flat, pixels = scratch[worker].reshape(-1), image.reshape(-1)
-    for i in range(rows.cells.size * worker // workers, rows.cells.size * (worker + 1) // workers):
-        top = rows.first + rows.factor * i
-        low, high = max(0, -top), min(n_taps, nx - top)
-        lines[i] = 0
-        _add_shifted(lines[i], pixels, (top + low) * ny, ny, rows.taps[low:high], 1, ny, WIDE, NARROW)
-        _split_phases(lines[i], columns, phases)
-        sums[:] = 0
-        for part in range(2):
-            for phase in range(columns.factor):
-                taps = columns.taps[part * (columns.taps.size // 2) :][: columns.taps.size // 2][phase:]
-                _add_shifted(sums[part], flat, phase * phases.shape[1], 1, taps, columns.factor, count, WIDE, NARROW)
-        for j in range(count):
-            grid[rows.cells[i], columns.cells[j]] = complex(sums[0, j], sums[1, j]) * rows.gains[i] * columns.gains[j]
+    for group in range(begin, end, GROUP):
+        top = rows.first + rows.factor * group
+        low, high = max(0, -top), min(n_taps + rows.margin, image.shape[0] - top)
+        size = min(GROUP, end - group)
+        tap = rows.margin + low
+        _weigh_rows(lines[group : group + size], image[top + low : top + high], rows.taps, tap, 1, -rows.factor)
+        for i in range(group, group + size):
+            _split_phases(lines[i], columns, phases)
+            _filter_phases(phases, columns, sums)
+            for j in range(columns.cells.size):
+                gain = rows.gains[i] * columns.gains[j]
+                grid[rows.cells[i], columns.cells[j]] = complex(sums[0, j], sums[1, j]) * gain
 
 
 @_jit
 def expand(grid, rows, columns, lines, scratch, worker, workers):
     """Transpose of the second half of `decimate`: samples in the grid to `lines`, Re of the conjugate."""
     phases, sums = scratch[worker, :-2], scratch[worker, -2:]
-    flat, width = scratch[worker].reshape(-1), scratch.shape[2]
-    n_taps, count = columns.taps.size // 2, columns.cells.size
-    margin = -(-n_taps // columns.factor)
+    shifts = -(-(columns.taps.size - 2 * columns.margin) // columns.factor)
     for i in range(rows.cells.size * worker // workers, rows.cells.size * (worker + 1) // workers):
         sums[:] = 0
-        for j in range(count):
+        for j in range(columns.cells.size):
             value = grid[rows.cells[i], columns.cells[j]] * np.conj(rows.gains[i] * columns.gains[j])
-            sums[0, margin + j], sums[1, margin + j] = value.real, value.imag
-        phases[:] = 0
-        for part in range(2):
-            for phase in range(columns.factor):
-                taps = columns.taps[part * n_taps :][:n_taps][phase:]
-                start = (columns.factor + part) * width + margin
-                _add_shifted(phases[phase], flat, start, -1, taps, columns.factor, width - margin, WIDE, NARROW)
+            sums[0, shifts + j], sums[1, shifts + j] = value.real, value.imag
+        _spread_phases(sums, columns, phases, shifts)
         _join_phases(phases, columns, lines[i])
 
 
 @_jit
 def expand_rows(lines, rows, image, worker, workers):
     """Transpose of the first half of `decimate`: lines to a real image (nx, ny)."""
-    nx, ny = image.shape
-    n_taps, flat = rows.taps.size // 2, lines.reshape(-1)
-    for pixel in range(nx * worker // workers, nx * (worker + 1) // workers):
-        offset = pixel - rows.first
-        low, high = max(0, -((n_taps - 1 - offset) // rows.factor)), min(rows.cells.size, offset // rows.factor + 1)
-        image[pixel] = 0
-        taps = rows.taps[offset - rows.factor * (high - 1) : n_taps]
-        _add_shifted(image[pixel], flat, (high - 1) * ny, -ny, taps[: rows.factor * (high - 1 - low) + 1], rows.factor,
-                     ny, WIDE, NARROW)
+    n_taps = rows.taps.size - 2 * rows.margin
+    begin, end = image.shape[0] * worker // workers, image.shape[0] * (worker + 1) // workers
+    for group in range(begin, end, GROUP):
+        size, offset = min(GROUP, end - group), group - rows.first
+        low = max(0, -((n_taps - 1 - offset) // rows.factor))
+        high = min(rows.cells.size, (offset + size - 1) // rows.factor + 1)
+        tap = rows.margin + offset - rows.factor * low
+        _weigh_rows(image[group : group + size], lines[low:high], rows.taps, tap, -rows.factor, 1)
 
 
 @_jit
-def _add_shifted(out, source, start, step, taps, tap_step, length, wide, narrow):
-    """out[j] += Σ_t taps[t·tap_step] · source[start + t·step + j] for j < length."""
-    n_taps, j = -(-taps.size // tap_step), 0
-    while j + len(wide) <= length:
-        total = load(out, j, wide)
-        for t in range(n_taps):
-            total = multiply_add(load(source, start + t * step + j, wide), taps[t * tap_step], total)
-        store(out, j, total)
-        j += len(wide)
-    while j + len(narrow) <= length:
-        total = load(out, j, narrow)
-        for t in range(n_taps):
-            total = multiply_add(load(source, start + t * step + j, narrow), taps[t * tap_step], total)
-        store(out, j, total)
-        j += len(narrow)
-    while j < length:
-        for t in range(n_taps):
-            out[j] += taps[t * tap_step] * source[start + t * step + j]
-        j += 1
+def _weigh_rows(out, rows, taps, first, row_step, out_step):
+    """out[r] = Σ_t taps[first + t·row_step + r·out_step].real · rows[t], for at most GROUP rows r."""
+    length = out.shape[1]
+    if length < len(WIDE):
+        for j in range(length):
+            _weigh_block(out, rows.reshape(-1), j, taps, first, row_step, out_step, SINGLE)
+    else:
+        for block in range(0, length, len(WIDE)):
+            _weigh_block(out, rows.reshape(-1), min(block, length - len(WIDE)), taps, first, row_step, out_step, WIDE)
+
+
+@_jit
+def _weigh_block(out, rows, column, taps, first, row_step, out_step, lanes):
+    """len(lanes) columns of `_weigh_rows`, in registers."""
+    length, pixels = out.shape[1], out.reshape(-1)
+    sum0 = sum1 = sum2 = sum3 = zeros(rows, lanes)
+    tap = first
+    for t in range(rows.size // length):
+        row = load(rows, t * length + column, lanes)
+        sum0 = multiply_add(row, taps[tap].real, sum0)
+        sum1 = multiply_add(row, taps[tap + out_step].real, sum1)
+        sum2 = multiply_add(row, taps[tap + 2 * out_step].real, sum2)
+        sum3 = multiply_add(row, taps[tap + 3 * out_step].real, sum3)
+        tap += row_step
+    for r in range(len(out)):
+        store(pixels, r * length + column, sum0)
+        sum0, sum1, sum2 = sum1, sum2, sum3
 
 
 @_jit
@@ -230,3 +238,34 @@ def _join_phases(phases, columns, line):
         low = -((columns.first + q) // columns.factor)
         for k in range(low, -(-(line.size - columns.first - q) // columns.factor)):
             line[columns.first + columns.factor * k + q] = phases[q, k]
+
+
+@_jit
+def _filter_phases(phases, columns, sums):
+    """sums[:, j] = (Re, Im) of Σ_t taps[t] · line[first + factor·j + t]."""
+    flat, width, both = phases.reshape(-1), phases.shape[1], sums.reshape(-1)
+    n_taps = columns.taps.size - 2 * columns.margin
+    for j in range(0, columns.cells.size, len(WIDE)):
+        real = imag = zeros(flat, WIDE)
+        for q in range(columns.factor):
+            for a in range(-(-(n_taps - q) // columns.factor)):
+                tap = columns.taps[columns.margin + columns.factor * a + q]
+                pixels = load(flat, q * width + a + j, WIDE)
+                real, imag = multiply_add(pixels, tap.real, real), multiply_add(pixels, tap.imag, imag)
+        store(both, j, real)
+        store(both, width + j, imag)
+
+
+@_jit
+def _spread_phases(sums, columns, phases, shifts):
+    """Transpose of `_filter_phases`, from sums[:, shifts + j]; zeros surround them."""
+    flat, width, both = phases.reshape(-1), phases.shape[1], sums.reshape(-1)
+    n_taps = columns.taps.size - 2 * columns.margin
+    for q in range(columns.factor):
+        for k in range(0, width - shifts, len(WIDE)):
+            total = zeros(flat, WIDE)
+            for a in range(-(-(n_taps - q) // columns.factor)):
+                tap = columns.taps[columns.margin + columns.factor * a + q]
+                total = multiply_add(load(both, shifts + k - a, WIDE), tap.real, total)
+                total = multiply_add(load(both, width + shifts + k - a, WIDE), tap.imag, total)
+            store(flat, q * width + k, total)

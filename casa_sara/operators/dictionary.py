@@ -1,18 +1,21 @@
 """The SARA dictionary Ψ: Dirac and Daubechies bases whose concatenation is a Parseval frame.
 
-Each basis is orthonormal (Daubechies wavelets with periodic boundaries) and is scaled by 1/√b, b the number of
-bases, so that Ψ Ψ† = I and ‖Ψ‖ = 1.
+Each basis is orthonormal (Daubechies wavelets with periodic boundaries, PyWavelets' mode 'periodization') and is scaled
+by 1/√b, b the number of bases, so that Ψ Ψ† = I and ‖Ψ‖ = 1.  Filters come from PyWavelets, the transforms from the
+compiled kernels next door; in single precision the coefficients agree with PyWavelets in double precision to 1e-6 of
+the largest.  An image whose size is not a multiple of 2**levels is continued with zeros for the transform and cut out
+of the synthesis, which keeps the frame Parseval.
 """
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 import pywt
 
 from casa_sara.operators import _wavelet_kernels as kernels
+from casa_sara.operators._workers import Workers
 from casa_sara.options import SARA_BASES
 
 __all__ = ["Band", "SaraDictionary"]
@@ -31,7 +34,7 @@ class Band(NamedTuple):
 
 
 class SaraDictionary:
-    """Ψ† (analysis), Ψ (synthesis) and the dual update of the ℓ1 prior.
+    """Ψ† (analysis), Ψ (synthesis) and the dual update of the ℓ1 prior, without allocation in a call.
 
     Parameters
     ----------
@@ -40,28 +43,33 @@ class SaraDictionary:
     wavelets : sequence of str
         Bases: 'dirac' and 'db1' … 'db8', each at most once.
     levels : int
-        Number of decomposition levels ≥ 1.
+        Number of decomposition levels, 1 to 10.
     dtype : float32 or float64
         Of images and coefficients.
     nthreads : int
-        Threads used by each call; the results do not depend on it.
+        Threads used by each call; results are the same, to the last bit, for any number.
 
     Attributes
     ----------
     coef_shape : (int, int, int)
-        (number of bases, NX, NY): each basis in the usual nested quadrants of a plane padded with zeros to the
-        next multiple of 2**levels.  Dirac coefficients are the pixels, in the corner [:nx, :ny] of their plane.
+        (number of bases, NX, NY): each basis in the usual nested quadrants of a plane padded to the next multiples of
+        2**levels.  Dirac coefficients are the pixels, in the corner [:nx, :ny] of their plane.
+    n_bases, n_coefs : int
 
     Raises
     ------
     ValueError
-        For an argument out of these ranges; the message names it.
+        For an argument out of these ranges; the message names the task parameter.
+
+    Notes
+    -----
+    The workspaces belong to the object: one call at a time.  Different objects may be used from different threads.
     """
 
     def __init__(self, shape, wavelets=SARA_BASES, levels=4, dtype=np.float32, nthreads=1):
         self.shape = tuple(int(n) for n in shape)
         self.wavelets = tuple(wavelets)
-        self.levels, self.nthreads, self.dtype = int(levels), int(nthreads), np.dtype(dtype)
+        self.levels, self.dtype = int(levels), np.dtype(dtype)
         self._validate()
         self.n_bases = len(self.wavelets)
         block = 1 << self.levels
@@ -69,39 +77,42 @@ class SaraDictionary:
         self.coef_shape = (self.n_bases, *padded)
         self.n_coefs = self.n_bases * padded[0] * padded[1]
         self._filters = _filters(self.wavelets, self.dtype)
-        self._owner = _shares(self._filters.lengths, self.nthreads)
+        self._workers = Workers(nthreads)
         self._work = self._workspaces()
         self._params = np.zeros((self.n_bases, self.levels, 4), self.dtype)
-        self._pool = ThreadPoolExecutor(self.nthreads - 1) if self.nthreads > 1 else None
 
     def _validate(self):
         if len(self.shape) != 2 or min(self.shape) < 1:
             raise ValueError(f"imsize must be two sizes of at least 1 pixel, not {self.shape}")
         if not self.wavelets or len(set(self.wavelets)) < len(self.wavelets) or set(self.wavelets) - set(SARA_BASES):
             raise ValueError(f"wavelets={list(self.wavelets)} must be distinct names out of {list(SARA_BASES)}")
-        if not 1 <= self.levels <= 16:
-            raise ValueError(f"wavelevels={self.levels} must be between 1 and 16")
+        if not 1 <= self.levels <= 10:
+            raise ValueError(f"wavelevels={self.levels} must be between 1 and 10")
         if self.dtype not in (np.float32, np.float64):
             raise ValueError(f"dtype must be float32 or float64, not {self.dtype}")
-        if self.nthreads < 1:
-            raise ValueError(f"nthreads={self.nthreads} must be at least 1")
 
     def _workspaces(self):
         nx, ny = self.coef_shape[1:]
-        size = self.dtype.itemsize
-        approx = sum((nx >> level) * kernels.padded_width(ny >> level, size) for level in range(1, self.levels + 1))
+        size, threads = self.dtype.itemsize, self._workers.count
+        approx = sum((nx >> level) * kernels.padded_width(ny >> level, size) for level in range(1, self.levels))
+        width = kernels.padded_width(ny + 2 * kernels.HALO, size)
         return kernels.Work(
             approx=_aligned((self.n_bases, approx), self.dtype),
-            window=_aligned((self.nthreads, kernels.WINDOW_ROWS, kernels.padded_width(ny, size)), self.dtype),
-            scratch=_aligned((self.nthreads, kernels.SCRATCH_ROWS, kernels.padded_width(ny, size)), self.dtype),
-            tables=np.zeros((self.nthreads, 3, kernels.TABLE_SIZE), np.int64))
+            owner=_shares(self._filters.lengths, threads),
+            window=_aligned((threads, kernels.WINDOW_ROWS, width), self.dtype),
+            scratch=_aligned((threads, kernels.SCRATCH_ROWS, width), self.dtype),
+            tables=np.zeros((threads, 2, kernels.TABLE_SIZE), np.int64))
 
     def allocate(self):
-        """Return a zeroed coefficient array of `coef_shape`."""
+        """Return a zeroed coefficient array of `coef_shape`, aligned as the kernels like it."""
         return _aligned(self.coef_shape, self.dtype)
 
     def bands(self):
-        """Return the list of all :class:`Band`; Dirac is one band of level 0, orientation 'aa'."""
+        """Return the list of all :class:`Band`, level 1 the finest.
+
+        Orientations are PyWavelets' keys: 'da' is detail along the first axis, approximation along the second; 'aa' is
+        the approximation of the deepest level.  Dirac is one band of level 0, orientation 'aa'.
+        """
         found = []
         nx, ny = self.coef_shape[1:]
         for b, length in enumerate(self._filters.lengths):
@@ -118,7 +129,7 @@ class SaraDictionary:
         return found
 
     def analysis(self, image, out=None):
-        """Return Ψ† image, of `coef_shape`, in `out` where given."""
+        """Return Ψ† image, an array of `coef_shape`, in `out` where given."""
         out = self.allocate() if out is None else self._checked(out, "out", self.coef_shape)
         self._analyse(image, kernels.Target(out, out, self._params, kernels.KEEP))
         return out
@@ -127,15 +138,19 @@ class SaraDictionary:
         """Return the image Ψ coefs, in `out` where given."""
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
-        self._deeper(kernels.Target(coefs, coefs, self._params, kernels.KEEP), forth=False, back=True)
-        self._synthesise(coefs, out)
+        target = kernels.Target(coefs, coefs, self._params, kernels.KEEP)
+        self._workers.run(kernels.transform_deeper, self._filters, target, self._work, False, True)
+        self._synthesise(target, out)
         return out
 
     def dual_step(self, model_bar, dual, threshold, weights=None, out=None):
-        """Update the dual variable of the prior in place and return Ψ dual.
+        """Update the dual variable of the prior in place and return Ψ dual, in one sweep over the bases.
 
-        dual ← clip(dual + Ψ† model_bar, ± threshold·weights), the proximal operator of the conjugate of
-        threshold·‖weights · ‖₁; Moreau: u − soft(u, threshold·weights).
+        With u = dual + Ψ† model_bar,
+
+            dual ← clip(u, ± threshold·weights) = u − soft(u, threshold·weights),
+
+        the proximal operator of the conjugate of threshold·‖weights · ‖₁ (Moreau).
 
         Parameters
         ----------
@@ -144,30 +159,41 @@ class SaraDictionary:
         dual : coef_shape
             Updated in place.
         threshold : float or (n_bases,)
-            κ, one number or one per basis.
+            κ ≥ 0, one number or one per basis.
         weights : coef_shape, optional
-            W; ones when None.
+            W ≥ 0; ones when None.
         out : (nx, ny), optional
             Receives Ψ dual.
+
+        Raises
+        ------
+        ValueError
+            An array of the wrong shape, type or order, or a negative threshold.
         """
         dual = self._checked(dual, "dual", self.coef_shape)
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
+        if not np.min(threshold) >= 0:
+            raise ValueError(f"threshold={threshold} must not be negative")
         self._params[:] = np.reshape(threshold, (-1, 1, 1))
         if weights is None:
             weights, mode = dual, kernels.CLIP
         else:
             weights, mode = self._checked(weights, "weights", self.coef_shape), kernels.CLIP_WEIGHTED
-        self._analyse(model_bar, kernels.Target(dual, weights, self._params, mode), back=True)
-        self._synthesise(dual, out)
+        target = kernels.Target(dual, weights, self._params, mode)
+        self._analyse(model_bar, target, back=True)
+        self._synthesise(target, out)
         return out
 
     def reweight(self, image, alpha, out):
-        """Fill `out` with the weights α/(α + |Ψ† image|), α > 0 per band in the order of `bands`."""
+        """Fill `out`, an array of `coef_shape`, with the weights α/(α + |Ψ† image|).
+
+        `alpha` > 0 is one number per band, in the order of `bands`, or one for all.
+        """
         out = self._checked(out, "out", self.coef_shape)
         bands = self.bands()
         alpha = np.broadcast_to(alpha, len(bands))
         if not np.all(alpha > 0):
-            raise ValueError("alpha must be positive in every band")
+            raise ValueError(f"alpha must be positive in every band, its minimum is {np.min(alpha)}")
         for band, value in zip(bands, alpha):
             self._params[band.basis, max(band.level, 1) - 1, ORIENTATIONS.index(band.orientation)] = value
         self._analyse(image, kernels.Target(out, out, self._params, kernels.REWEIGHT))
@@ -181,22 +207,11 @@ class SaraDictionary:
 
     def _analyse(self, image, target, back=False):
         image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
-        self._run(kernels.analyse_finest, image, self._filters, target, self._work)
-        self._deeper(target, forth=True, back=back)
+        self._workers.run(kernels.analyse_finest, image, self._filters, target, self._work)
+        self._workers.run(kernels.transform_deeper, self._filters, target, self._work, True, back)
 
-    def _deeper(self, target, forth, back):
-        if self.levels > 1:
-            self._run(kernels.transform_deeper, self._filters, target, self._work, self._owner, forth, back)
-
-    def _synthesise(self, coefs, out):
-        self._run(kernels.synthesise_finest, coefs, self.levels, self._filters, self._work, out)
-
-    def _run(self, kernel, *args):
-        """Run one stage on all threads and wait for it."""
-        others = [self._pool.submit(kernel, *args, worker, self.nthreads) for worker in range(1, self.nthreads)]
-        kernel(*args, 0, self.nthreads)
-        for other in others:
-            other.result()
+    def _synthesise(self, target, out):
+        self._workers.run(kernels.synthesise_finest, out, self._filters, target, self._work)
 
 
 def _aligned(shape, dtype):

@@ -18,10 +18,11 @@ from __future__ import annotations
 import numpy as np
 
 from casa_sara.operators._workers import Workers
-from casa_sara.operators.decimation import AxisDecimation, Separable, decimate, expand, expand_rows, scratch_shape
+from casa_sara.operators.decimation import (
+    AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable)
 from casa_sara.operators.nufft import NonUniformFFT
 
-__all__ = ["MeasurementOperator", "choose_eps", "dirty_image", "psf"]
+__all__ = ["MeasurementOperator", "choose_eps"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 SMALLEST_EPS = {np.dtype(np.float32): 1e-6, np.dtype(np.float64): 1e-13}
@@ -85,16 +86,11 @@ class MeasurementOperator:
         inner = np.stack([axis.factor * (f - axis.centre) for axis, f in zip(axes, frequencies)])
         starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
         self._nufft = NonUniformFFT(inner, scales / response[:, None], starts, counts, eps, self.dtype, self._workers)
-        self._rows = self._separable(axes[0], 0, self._nufft.rows, self._nufft.row_factors)
-        self._columns = self._separable(axes[1], 1, self._nufft.columns, self._nufft.column_factors)
+        self._rows, self._columns = (
+            separable(axis, size, cells, factors, self.complex_dtype)
+            for axis, size, (cells, factors) in zip(axes, self.shape, self._nufft.placement))
         self._lines = np.zeros((counts[0], self.shape[1]), self.dtype)
         self._scratch = np.zeros(scratch_shape(self._columns, self._workers.count), self.dtype)
-
-    def _separable(self, axis, number, cells, factors):
-        first = axis.factor * axis.start - axis.taps.size // 2 + self.shape[number] // 2
-        gains = factors * axis.modulation(axis.start + np.arange(axis.count))
-        taps = np.concatenate([axis.taps.real, axis.taps.imag])
-        return Separable(taps.astype(self.dtype), axis.factor, first, cells, gains.astype(self.complex_dtype))
 
     def forward(self, image, out=None):
         """Return the visibilities Φ·image, complex (M,), of a real image (nx, ny), in `out` where given."""
@@ -137,26 +133,6 @@ def _checked(array, name, shape, dtype):
     if array.shape != shape or array.dtype != dtype or not array.flags.c_contiguous:
         raise ValueError(f"{name} must be a C-contiguous {dtype} array of shape {shape}")
     return array
-
-
-def dirty_image(operator, vis, weights):
-    """Return the dirty image Σ_k w_k·Re(V_k·exp(−2πi…)) / Σ w, in Jy/beam as tclean's.
-
-    Parameters
-    ----------
-    operator : MeasurementOperator
-        Without `row_scale`; an accuracy of 1e-5 is plenty.
-    vis : complex (M,)
-        Jy; residual visibilities give the residual image.
-    weights : real (M,)
-        Natural, uniform or Briggs imaging weights.
-    """
-    return operator.adjoint(np.multiply(vis, weights)) / operator.dtype.type(np.sum(weights, dtype=np.float64))
-
-
-def psf(operator, weights):
-    """Return the point-spread function, the dirty image of a unit source at pixel (nx//2, ny//2), its peak 1."""
-    return dirty_image(operator, np.ones(operator.size, operator.complex_dtype), weights)
 
 
 def choose_eps(vis, weight, fraction=0.1):

@@ -40,7 +40,7 @@ def _selection(parameters):
     vis = parameters["vis"]
     vis = (vis,) if isinstance(vis, str) else tuple(vis)
     chosen = {name: parameters[name] for name in Selection.PARAMETERS}
-    chosen = {name: value if isinstance(value, str) else tuple(value) for name, value in chosen.items()}
+    chosen = {name: tuple(value) if isinstance(value, list) else str(value) for name, value in chosen.items()}
     return Selection(vis, datacolumn=parameters["datacolumn"], **chosen)
 
 
@@ -73,6 +73,8 @@ def _solver_options(parameters):
     if parameters["databound"] == "fixed" and not (parameters["l2bound"] and min(parameters["l2bound"]) > 0):
         raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
                          "blocks or one for each, in units of what the weights say")
+    if not parameters["regscale"] > 0:
+        raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the noise")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}
     values = {name: tuple(value) if isinstance(value := parameters[name], list) else value for name in names}
     return SolverOptions(nthreads=parameters["nthreads"] or available_cores(), **values)

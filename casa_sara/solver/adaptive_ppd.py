@@ -49,17 +49,19 @@ class AdaptivePPD:
     Attributes
     ----------
     model, model_bar : real (nx, ny)
-        x and x̄, Jy/pixel.
+        x and x̄.
     l1_dual, l2_dual
         u and v.
     l1_weights
         W, or None for ones.
     threshold : float
-        κ in Jy/pixel: only the speed depends on it, but see :meth:`rescale`.
+        κ, in the unit of the model: only the speed depends on it, but see :meth:`rescale`.
     residual_norms : float (d,)
         μ_j of the model before the last step.
     rel_change : float
         σ.
+    unit_jy : float
+        Jy/pixel in the unit of the model, for the record.
     """
 
     def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True):
@@ -79,6 +81,7 @@ class AdaptivePPD:
         self.residual_norms = np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()])
         self.rel_change = np.inf
         self.iteration = 0
+        self.unit_jy = 1.0
 
     @property
     def n_blocks(self):
@@ -90,7 +93,7 @@ class AdaptivePPD:
         return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
     def start_from(self, model):
-        """Set x and x̄ to `model` (Jy/pixel); the dual variables stay."""
+        """Set x and x̄ to `model`; the dual variables stay."""
         self.model[...] = model
         self.model_bar[...] = model
         self.measurement.forward(self.model, self._phi_model)

@@ -30,78 +30,37 @@ def chi_square_bounds(samples, noise=1.0):
     return np.asarray(noise) * np.sqrt(degrees + 2 * np.sqrt(2 * degrees))
 
 
-class GivenBounds:
-    """Bounds that stay as they are: hard constraints ‖y_j − Φ_j x‖ ≤ ε_j."""
-
-    def __init__(self, l2_bounds):
-        self.l2_bounds = np.asarray(l2_bounds, float)
-
-    @property
-    def noise_weights(self):
-        """Relative weight 1/σ_j² of the blocks, here equal."""
-        return np.ones_like(self.l2_bounds)
-
-    def apply_to(self, ppd):
-        """Hand the bounds to the iteration."""
-        ppd.l2_bounds = self.l2_bounds
-
-    def adapt(self, ppd):
-        """Nothing adapts; return False."""
-        return False
-
-    def met_by(self, ppd):
-        """Whether every block's residual is inside its bound, but for a relative 1e-3."""
-        return bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3)))
-
-
 @dataclass
-class AdaptiveBounds:
-    """Bounds that follow the residual of each block (Algorithm 1, Steps 6–10) and set its multiplier.
+class _NoiseLevels:
+    """What given and adaptive bounds share: noise levels, and the multipliers that belong to them.
 
     A bound is a noise level, ε_j = σ_j √(2M_j), σ_j in units of what the weights say, thermal noise and
-    calibration errors together.  It moves as in the paper: when the model has settled (σ < γ1), at least P
-    iterations after the last move, and when the residual differs by more than γ2, by the fraction γ3 of the
-    way to the residual norm μ_j.  It never falls below `floor`, the noise measured from the data themselves.
-
-    The level fixes the Lagrange multiplier of the block's ellipsoid, instead of the ellipsoid's radius: the
-    image minimises
+    calibration errors together.  The level fixes the Lagrange multiplier of the block's ellipsoid: the image
+    that minimises
 
         κ_g ‖WΨ†x‖₁ + ½ Σ_j ‖y_j − Φ_j x‖²/σ_j²,     κ_g = regscale · √(Σ_j σ_j⁻² Σ_{m∈j} w_m) / √b,
 
-    where κ_g is the noise of one Dirac coefficient of the gradient Φ†n (w the whitening weights, b bases), so
-    that regscale = 1 thresholds at the noise.  In Algorithm 1, whose κ is free, that is λ_j = κ/(η κ_g σ_j²).
+    is regularised at the noise: κ_g is the noise of one Dirac coefficient of the gradient Φ†n (w the whitening
+    weights, b bases), times regscale.  In Algorithm 1, whose κ is free, that is λ_j = κ/(η κ_g σ_j²).
     A radius would have to be right to a fraction 1/√(2M_j) to mean anything; a multiplier need not.
 
     Parameters
     ----------
     l2_bounds : float (d,)
-        First guess, e.g. of NNLS.
+        ε_j, whitened.
     samples : int (d,)
         M_j.
     weight_sums : float (d,)
-        Σ w over the block, 1/Jy².
+        Σ w over the block, in the units of the model.
     n_bases : int
-    floor : float (d,)
-        Lowest bounds allowed.
-    rel_change, tol, step, min_interval
-        γ1, γ2, γ3, P.
+    regscale : float
     """
 
     l2_bounds: np.ndarray
     samples: np.ndarray
     weight_sums: np.ndarray
     n_bases: int
-    floor: np.ndarray
     regscale: float = 1.0
-    rel_change: float = 1e-2
-    tol: float = 1e-2
-    step: float = 0.618
-    min_interval: int = 20
-    _last_move: np.ndarray = field(init=False)
-
-    def __post_init__(self):
-        self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
-        self._last_move = np.zeros(len(self.l2_bounds), int)
 
     @property
     def noise(self):
@@ -115,13 +74,61 @@ class AdaptiveBounds:
 
     @property
     def gradient_noise(self):
-        """κ_g, in 1/Jy."""
+        """κ_g."""
         return self.regscale * np.sqrt(np.sum(self.weight_sums * self.noise_weights) / self.n_bases)
 
     def apply_to(self, ppd):
         """Hand the multipliers to the iteration, for its current κ."""
         ppd.l2_bounds = None
         ppd.multipliers[:] = ppd.threshold / (ppd.l2_step * self.gradient_noise) * self.noise_weights
+
+
+@dataclass
+class GivenBounds(_NoiseLevels):
+    """Bounds that stay as they are, and are hard constraints ‖y_j − Φ_j x‖ ≤ ε_j of the last problem."""
+
+    def finish(self, ppd):
+        """Make the bounds hard constraints, from where the multipliers have led."""
+        ppd.l2_bounds = self.l2_bounds
+
+    def adapt(self, ppd):
+        """Nothing adapts; return False."""
+        return False
+
+    def met_by(self, ppd):
+        """Whether every block's residual is inside its bound, but for a relative 1e-3."""
+        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3)))
+
+
+@dataclass
+class AdaptiveBounds(_NoiseLevels):
+    """Bounds that follow the residual of each block (Algorithm 1, Steps 6–10).
+
+    A bound moves as in the paper: when the model has settled (σ < γ1), at least P iterations after its last
+    move, and when the residual differs by more than γ2, by the fraction γ3 of the way to the residual norm μ_j.
+    It never falls below `floor`, the noise measured from the data themselves.
+
+    Parameters
+    ----------
+    floor : float (d,)
+        Lowest bounds allowed.
+    rel_change, tol, step, min_interval
+        γ1, γ2, γ3, P.
+    """
+
+    floor: np.ndarray | float = 0.0
+    rel_change: float = 1e-2
+    tol: float = 1e-2
+    step: float = 0.618
+    min_interval: int = 20
+    _last_move: np.ndarray = field(init=False)
+
+    def __post_init__(self):
+        self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
+        self._last_move = np.zeros(len(self.l2_bounds), int)
+
+    def finish(self, ppd):
+        """Nothing changes for the last problem."""
 
     def adapt(self, ppd):
         """Steps 7–10; return whether any bound moved."""

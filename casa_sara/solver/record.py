@@ -6,16 +6,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["CONVERGED", "DIVERGED", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER", "SolverRecord",
-           "STOP_DESCRIPTIONS"]
+__all__ = ["CONVERGED", "DIVERGED", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER", "STOP_DESCRIPTIONS",
+           "SolverRecord", "UNFEASIBLE"]
 
-CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, DIVERGED = 101, 102, 103, 104, 105
+CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, DIVERGED, UNFEASIBLE = 101, 102, 103, 104, 105, 106
 STOP_DESCRIPTIONS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "iteration limit",
     NOISE_ONLY: "noise only",
     STOPPED_BY_USER: "stopped by user",
     DIVERGED: "diverged",
+    UNFEASIBLE: "converged, but the data do not fit the bounds",
 }
 
 
@@ -63,5 +64,5 @@ class SolverRecord:
         self.reweighting.append(reweighting)
         self.rel_change.append(ppd.rel_change)
         self.residual_norm.append(float(np.linalg.norm(ppd.residual_norms)))
-        self.model_flux.append(float(ppd.model.sum(dtype=float)))
-        self.model_max.append(float(ppd.model.max()))
+        self.model_flux.append(float(ppd.model.sum(dtype=float)) * ppd.unit_jy)
+        self.model_max.append(float(ppd.model.max()) * ppd.unit_jy)

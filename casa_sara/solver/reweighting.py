@@ -6,11 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, SolverRecord
+from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE, SolverRecord
 
 __all__ = ["Schedule", "band_noise", "solve"]
 
+RISE = 1.05  # of the residual norm within one interval, from its least
+STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
+
+FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
+PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
 
 @dataclass(frozen=True)
@@ -37,8 +42,8 @@ class Schedule:
     nreweights: int = 20
     reweight_decay: float = 0.618
     reweight_tol: float = 1e-2
-    reltol: float = 2e-4
-    final_reltol: float = 1e-4
+    reltol: float = 3e-4
+    final_reltol: float = 3e-4
     interval: int = 30
 
     @property
@@ -48,7 +53,7 @@ class Schedule:
 
 
 def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
-    """Standard deviation of the noise in every band of the dictionary, Jy/pixel.
+    """Standard deviation of the noise in every band of the dictionary, in the unit of the model.
 
     One realisation of the noise, weighted by 1/σ_j² as the data are, is carried to the image and normalised by
     the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
@@ -89,7 +94,7 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
         The iteration, with its first κ (`threshold`) set.
     bounds : GivenBounds or AdaptiveBounds
     weight_sums : float (d,)
-        Σ w of each block, 1/Jy².
+        Σ w of each block, in the unit of the model.
     schedule : Schedule
     progress : callable
         Called after every iteration with (ppd, record).
@@ -104,29 +109,33 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
     bounds.apply_to(ppd)
     record.bounds.append((0, bounds.l2_bounds.copy()))
     previous = ppd.model.copy()
-    for k in range(schedule.nreweights + 1):
-        last = k == schedule.nreweights
-        record.stop_code = _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped)
+
+    def solve_one(k, last):
+        return _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped)
+
+    for k in range(schedule.nreweights):
+        record.stop_code = solve_one(k, False)
         if record.stop_code != CONVERGED:
             break
         change = _relative(ppd.model, previous)
-        if last:
-            break
         scale = FIRST_SCALE * schedule.reweight_decay**k
         if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd):
             break
         previous[...] = ppd.model
         _reweight(ppd, bounds, weight_sums, max(scale, LAST_SCALE))
         record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change))
+    if record.stop_code in (0, CONVERGED):
+        bounds.finish(ppd)
+        record.stop_code = solve_one(len(record.reweightings), True)
     if record.stop_code == DIVERGED:
         ppd.model[...] = previous
     return record
 
 
 def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
-    """Algorithm 1 for one set of weights; return its stop code."""
+    """Algorithm 1 for one set of weights, the k-th; return its stop code."""
     tolerance = schedule.final_reltol if last else schedule.reltol
-    start = ppd.iteration
+    start, settled = ppd.iteration, 0
     while True:
         ppd.step()
         record.note(ppd, k)
@@ -140,10 +149,17 @@ def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
         if ppd.iteration >= schedule.niter:
             return ITERATION_LIMIT
         done = ppd.iteration - start
-        if done > 1 and ppd.rel_change < tolerance and bounds.met_by(ppd):
+        if done % schedule.interval == 0:
+            _damp(ppd, record.residual_norm[-schedule.interval:])
+        if not last and done >= (FIRST_INTERVALS if k == 0 else 1) * schedule.interval:
             return CONVERGED
-        if not last and done >= (2 if k == 0 else 1) * schedule.interval:
+        # the model has settled; the residual and the bounds may need longer, but not for ever
+        settled = settled + 1 if ppd.rel_change < tolerance else 0
+        steady = not last or _is_steady(record.residual_norm[start:], schedule.interval)
+        if done > 1 and settled and steady and bounds.met_by(ppd):
             return CONVERGED
+        if settled >= PATIENCE:
+            return UNFEASIBLE
 
 
 def _reweight(ppd, bounds, weight_sums, scale):
@@ -152,6 +168,22 @@ def _reweight(ppd, bounds, weight_sums, scale):
     alpha = scale * band_noise(ppd, bounds.noise_weights, weight_sums)
     ppd.dictionary.reweight(ppd.model, np.maximum(alpha, 1e-30), ppd.l1_weights)
     bounds.apply_to(ppd)
+
+
+def _damp(ppd, residual_norms):
+    """Halve κ where the residual rises again: the prior moves the image further than the data can follow.
+
+    κ is how far one iteration can move what only the prior knows of; the larger it is, the harder, and the less
+    damped, are the constraints of the data.
+    """
+    if residual_norms[-1] > RISE * min(residual_norms):
+        ppd.rescale(0.5 * ppd.threshold)
+
+
+def _is_steady(residual_norms, interval):
+    """Whether the residual has changed by less than `STEADY` within the last interval."""
+    recent = residual_norms[-interval:]
+    return len(recent) == interval and max(recent) - min(recent) < STEADY * recent[-1]
 
 
 def _relative(model, previous):

@@ -44,9 +44,9 @@ PARAMETERS = (
     Parameter('nreweights', ('int',), 20, 'Maximum number of re-weightings', minimum=0.0),
     Parameter('reweightdecay', ('double',), 0.618, 'Factor on the scale of the sparsity weights at each re-weighting', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
     Parameter('reweighttol', ('double',), 0.01, 'Relative change of the model between re-weightings that ends them', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
-    Parameter('reltol', ('double',), 0.0002, 'Relative change of the model in one iteration that counts as converged', minimum=0.0, maximum=1.0),
-    Parameter('finalreltol', ('double',), 0.0001, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
-    Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic soft threshold', minimum=0.0),
+    Parameter('reltol', ('double',), 0.0003, 'Relative change of the model in one iteration that counts as converged', minimum=0.0, maximum=1.0),
+    Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
+    Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
     Parameter('blocks', ('int',), 0, 'Number of data blocks, each with its own bound; 0: one per snapshot', minimum=0.0),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0),
     Parameter('fullsummary', ('bool',), False, 'Return dictionary with complete convergence history'),
@@ -311,16 +311,17 @@ class _tsara:
         Re-weighting ends when one more changes the model by less than this, relatively. (The
         varrho of the paper.)
 
-    reltol : float, default 0.0002
-        Convergence also needs every bound on the data to be met. After it the next re-weighting
-        starts.
+    reltol : float, default 0.0003
+        Where every bound on the data is met too, the next re-weighting starts; otherwise after 30
+        iterations (60 of the first).
 
-    finalreltol : float, default 0.0001
-        The tolerance of the last run, in place of reltol. It must not exceed reltol.
+    finalreltol : float, default 0.0003
+        The tolerance of the last run, in place of reltol.
 
     regscale : float, default 1.0
-        The soft threshold is chosen from the data. It sets the pace of the solver, not the image
-        it converges to; other values are for slow or oscillating cases.
+        The weight of the sparsity prior against the data: 1 is the noise of one coefficient of the
+        gradient of the data, from the noise levels found and the weights. Larger values give a
+        smoother image, smaller ones follow the noise.
 
     blocks : int, default 0
         0 makes one block of each MeasurementSet, observation and scan, and splits long scans in
@@ -390,7 +391,7 @@ class _tsara:
         uvtaper=[], restoration=True, restoringbeam=[], niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
         precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
-        l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0002, finalreltol=0.0001,
+        l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003,
         regscale=1.0, blocks=0, nthreads=0, fullsummary=False, restart=False, overwrite=False, savemodel='none',
         parallel=False,
     ):
