@@ -14,7 +14,7 @@ from casa_sara.operators.measurement import MeasurementOperator, choose_eps
 
 CELL = np.array([1.1e-6, 0.9e-6])
 SINGLE = [(np.float32, eps) for eps in (1e-3, 1e-4, 1e-5, 1e-6)]
-DOUBLE = [(np.float64, eps) for eps in (1e-6, 1e-9, 1e-12)]
+DOUBLE = [(np.float64, eps) for eps in (1e-8, 1e-12)]
 SHAPES = [(64, 48), (33, 47), (1, 1), (2, 3), (1, 100), (200, 101)]
 
 
@@ -37,7 +37,7 @@ def complex_normal(rng, size):
 
 
 @pytest.mark.parametrize("dtype, eps", SINGLE + DOUBLE)
-@pytest.mark.parametrize("fill", [1.0, 0.84, 0.839, 0.5, 0.4, 0.1])
+@pytest.mark.parametrize("fill", [1.0, 0.84, 0.42, 0.1])
 def test_forward_and_adjoint_equal_the_fourier_sum(fill, dtype, eps):
     for number, shape in enumerate(SHAPES):
         rng = np.random.default_rng(number)

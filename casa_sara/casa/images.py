@@ -79,7 +79,7 @@ def read_model(name, plane):
         with opened("image", name) as ia:
             shape, unit, csys = tuple(ia.shape()), ia.brightnessunit(), ia.coordsys()
             if len(shape) < 2 or int(np.prod(shape[2:])) != 1:
-                raise ValueError(f"startmodel = '{name}' has the shape {shape}: it takes one plane, Stokes I and one channel")
+                raise ValueError(f"startmodel = '{name}' has the shape {shape}: it takes one Stokes, one channel")
             pixels = np.where(read_pixels(ia, getmask=True), read_pixels(ia), np.float32(0))
     except RuntimeError as error:
         raise ValueError(f"startmodel = '{name}' cannot be read as an image: {error}") from error

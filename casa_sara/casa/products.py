@@ -41,7 +41,7 @@ def check_imagename(imagename, shape):
     folder, base = os.path.split(imagename)
     folder = folder or "."
     if not base:
-        raise ValueError(f"imagename = '{imagename}' is not a name: it takes the root of the images' names, as 'run/source'")
+        raise ValueError(f"imagename = '{imagename}' is not a name: it takes the images' common root, as 'run/source'")
     if not os.path.isdir(folder):
         raise FileNotFoundError(f"imagename = '{imagename}': the folder '{folder}' does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
@@ -49,8 +49,8 @@ def check_imagename(imagename, shape):
     needed = (len(PRODUCTS) * 4 + 3) * int(np.prod(shape)) + 2_000_000
     free = shutil.disk_usage(folder).free
     if free < needed:
-        message = f"imagename = '{imagename}': the images take {needed / 1e6:.0f} MB, '{folder}' has {free / 1e6:.0f} MB left"
-        raise OSError(errno.ENOSPC, message)
+        space = f"the images take {needed / 1e6:.0f} MB, '{folder}' has {free / 1e6:.0f} MB left"
+        raise OSError(errno.ENOSPC, f"imagename = '{imagename}': {space}")
 
 
 @contextmanager

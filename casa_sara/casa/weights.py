@@ -54,7 +54,7 @@ def sampling_density(visibilities, selection, grid):
     u, v = _field_uv(visibilities, "data")
     cells = _cells(u, v, (side, side), (cell, cell))
     density = np.zeros(visibilities.size, np.float32)
-    for number in visibilities.spws:
+    for number in np.unique(visibilities.rows.ms):
         density += _imager_grid(visibilities.ms_names[number], selection.of(number), side, cell)[cells]
     weight = visibilities.imaging_weight
     bad = ~((density >= 0.5 * weight) & np.isfinite(density))
@@ -98,7 +98,7 @@ def imaging_weights(visibilities, grid, weighting):
         cells = _cells(-u, v, shape, grid.cell_rad)
         counts = _count(cells, _cells(u, -v, shape, grid.cell_rad), weights, shape[0] * shape[1])
         if not counts.any():
-            raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: it takes 0 or a larger number")
+            raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
         density = counts[cells]
         if weighting.weighting == "briggs":
             scale = (5.0 * 10.0**-weighting.robust) ** 2 * counts.sum() / np.square(counts).sum()

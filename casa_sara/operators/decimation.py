@@ -154,8 +154,8 @@ def decimate(image, rows, columns, grid, lines, scratch, worker, workers):
         top = rows.first + rows.factor * group
         low, high = max(0, -top), min(n_taps + rows.margin, image.shape[0] - top)
         size = min(GROUP, end - group)
-        tap = rows.margin + low
-        _weigh_rows(lines[group : group + size], image[top + low : top + high], rows.taps, tap, 1, -rows.factor)
+        tap, pixels = rows.margin + low, image[top + low : top + high]
+        _weigh_rows(lines[group : group + size], pixels, rows.taps, tap, np.int64(1), -rows.factor)
         for i in range(group, group + size):
             _split_phases(lines[i], columns, phases)
             _filter_phases(phases, columns, sums)
@@ -188,7 +188,7 @@ def expand_rows(lines, rows, image, worker, workers):
         low = max(0, -((n_taps - 1 - offset) // rows.factor))
         high = min(rows.cells.size, (offset + size - 1) // rows.factor + 1)
         tap = rows.margin + offset - rows.factor * low
-        _weigh_rows(image[group : group + size], lines[low:high], rows.taps, tap, -rows.factor, 1)
+        _weigh_rows(image[group : group + size], lines[low:high], rows.taps, tap, -rows.factor, np.int64(1))
 
 
 @_jit
