@@ -53,7 +53,7 @@ class Schedule:
 
 
 def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
-    """Standard deviation of the noise in every band of the dictionary, in the unit of the model.
+    """Standard deviation of the noise in every band of the dictionary, and of a pixel, in the unit of the model.
 
     One realisation of the noise, weighted by 1/σ_j² as the data are, is carried to the image and normalised by
     the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
@@ -65,12 +65,14 @@ def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
     noise_weights : float (d,)
         1/σ_j².
     weight_sums : float (d,)
-        Σ w of each block.
+        Σ w of each block, in the unit of the model.
 
     Returns
     -------
-    float (number of bands,)
+    bands : float (number of bands,)
         In the order of `dictionary.bands()`.
+    pixel : float
+        Of a Dirac coefficient, which is a pixel divided by √(number of bases).
     """
     rng = np.random.default_rng(seed)
     noise = np.empty_like(ppd.vis)
@@ -79,14 +81,20 @@ def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
     image = ppd.measurement.adjoint(noise)
     image /= image.dtype.type(np.sum(weight_sums * noise_weights))
     coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
-    return np.array([np.sqrt(np.mean(np.square(coefs[band.slice], dtype=float))) for band in ppd.dictionary.bands()])
+    bands = [_rms(coefs[band.slice]) for band in ppd.dictionary.bands()]
+    return np.maximum(bands, 1e-30), _rms(image) / np.sqrt(ppd.dictionary.n_bases)
+
+
+def _rms(values):
+    return float(np.sqrt(np.mean(np.square(values, dtype=float))))
 
 
 def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False):
     """Algorithm 2: solve, re-weight, and solve again until nothing changes.
 
-    The weights of re-weighting k are W = α/(α + |Ψ†x|) with α = max(10 ω^{k−1}, 1.5) × the noise of the band,
-    where the paper has ω^k × the largest coefficient of the basis: docs/decisions.md, "Weights from the noise".
+    The weights start at W = ν, the noise of each band relative to that of a pixel (at least 1); those of
+    re-weighting k are W = ν α/(α + |Ψ†x|) with α = max(10 ω^{k−1}, 1.5) × the noise of the band.  The paper has
+    1 and ω^k × the largest coefficient of the basis: docs/decisions.md, "Weights from the noise".
 
     Parameters
     ----------
@@ -107,6 +115,7 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
     """
     record = SolverRecord()
     bounds.apply_to(ppd)
+    _first_weights(ppd, bounds, weight_sums)
     record.bounds.append((0, bounds.l2_bounds.copy()))
     previous = ppd.model.copy()
 
@@ -162,11 +171,25 @@ def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
             return UNFEASIBLE
 
 
-def _reweight(ppd, bounds, weight_sums, scale):
+def _first_weights(ppd, bounds, weight_sums):
+    """W = ν: the noise of every band in units of a pixel's, but at least 1.
+
+    Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
+    threshold at the noise of one pixel would let it through.
+    """
     if ppd.l1_weights is None:
         ppd.l1_weights = ppd.dictionary.allocate()
-    alpha = scale * band_noise(ppd, bounds.noise_weights, weight_sums)
-    ppd.dictionary.reweight(ppd.model, np.maximum(alpha, 1e-30), ppd.l1_weights)
+    noise, pixel = band_noise(ppd, bounds.noise_weights, weight_sums)
+    for band, level in zip(ppd.dictionary.bands(), noise):
+        ppd.l1_weights[band.slice] = max(level / pixel, 1.0)
+
+
+def _reweight(ppd, bounds, weight_sums, scale):
+    """W = ν α/(α + |Ψ†x|), α = scale × the noise of the band."""
+    noise, pixel = band_noise(ppd, bounds.noise_weights, weight_sums)
+    ppd.dictionary.reweight(ppd.model, scale * noise, ppd.l1_weights)
+    for band, level in zip(ppd.dictionary.bands(), noise):
+        ppd.l1_weights[band.slice] *= ppd.l1_weights.dtype.type(max(level / pixel, 1.0))
     bounds.apply_to(ppd)
 
 
