@@ -137,9 +137,9 @@ def contestants(uv, cell, shape, nthreads):
     yield "this operator, 1e-5", MeasurementOperator(*common, eps=1e-5, nthreads=nthreads)
     yield "this operator, 1e-4", MeasurementOperator(*common, eps=1e-4, nthreads=nthreads)
     yield "decimation + ducc0, single, 1e-5", decimated(Ducc)(*common, 1e-5, "f4", nthreads)
-    yield "decimation + finufft, single, 1e-5", decimated(Finufft)(*common, 1e-5, "f4", nthreads)
+    yield "decimation + finufft, single, 1e-5", decimated(Finufft)(*common, 1e-5, "f4", nthreads, upsampfac=1.25)
     yield "ducc0, single, 1e-5", Ducc(*common, 1e-5, "f4", nthreads)
-    yield "finufft, single, 1e-5", Finufft(*common, 1e-5, "f4", nthreads)
+    yield "finufft, single, 1e-5", Finufft(*common, 1e-5, "f4", nthreads, upsampfac=1.25)
     yield "finufft, double, its default 1e-6", Finufft(*common, 1e-6, "f8", nthreads)
 
 
@@ -204,8 +204,9 @@ def run(case, nthreads, repeats, bytes_per_s):
     spread = np.subtract(*np.percentile(times, [75, 25], axis=0)) / 2
     floor = f"{1e3 * floor_bytes(entries[0][1]) / bytes_per_s:.1f}"
     for number, (name, _) in enumerate(entries):
+        floor = floor if number == 0 else ""
         print(f"| {nx}×{ny}, {uv.shape[1]:.2g} | {name} | {median[number]:.1f} ± {spread[number]:.1f} "
-              f"| {median[number] / median[0]:.2f} | {errors[number]:.1e} | {floor if number == 0 else ''} |", flush=True)
+              f"| {median[number] / median[0]:.2f} | {errors[number]:.1e} | {'' if number else floor} |", flush=True)
 
 
 def main():

@@ -95,19 +95,24 @@ def _basis(direction):
     )
 
 
-def _converted(vector, frame, target):
-    """Return a unit vector of one direction frame in another one."""
+def _converted(vector, frame, target, epoch_s):
+    """Return a unit vector of one direction frame in another one, at a time (MJD seconds, UTC) where it matters."""
     direction = _direction(frame, np.arctan2(vector[1], vector[0]), np.arctan2(vector[2], np.hypot(*vector[:2])))
-    return _basis(_measures().measure(direction, target))[2]
+    me = _measures()
+    if epoch_s is not None:
+        me.doframe(me.epoch("UTC", f"{epoch_s!r}s"))
+    return _basis(me.measure(direction, target))[2]
 
 
-def rotation_between(field, image):
+def rotation_between(field, image, epoch_s=None):
     """Return the matrix that takes (u, v, w) at one phase centre to those at another.
 
     Parameters
     ----------
     field, image : dict
         Direction measures, in whatever frames.
+    epoch_s : float, optional
+        Time of the observation, MJD seconds UTC: B1950 and J2000 turn against each other by 0.6 arcsec in 40 years.
 
     Returns
     -------
@@ -116,7 +121,7 @@ def rotation_between(field, image):
     """
     basis_field, basis_image = _basis(field), _basis(image)
     if field["refer"] != image["refer"]:
-        step, frames = 1e-3, (field["refer"], image["refer"])
+        step, frames = 1e-3, (field["refer"], image["refer"], epoch_s)
         towards = _converted(basis_field[2], *frames)
         ahead = _converted(np.cos(step) * basis_field[2] + np.sin(step) * basis_field[1], *frames)
         north = ahead - towards * (towards @ ahead)
@@ -150,7 +155,7 @@ class Geometry:
 
     def __init__(self, ms, image):
         self._ms = ms
-        self._rotations = {field: rotation_between(centre, image) for field, centre in ms.fields.items()}
+        self._rotations = {field: rotation_between(centre, image, ms.start_s) for field, centre in ms.fields.items()}
         self._factors = {}
         self.freq_range_hz = [np.inf, 0.0]
 

@@ -61,6 +61,7 @@ class SelectedMS:
     groups : tuple of RowGroup
     fields : dict, selected field number → phase centre (direction measure)
     observatory : str, and `position`, its position measure
+    start_s : float, time of the first selected row, MJD seconds UTC
     """
 
     number: int
@@ -70,6 +71,7 @@ class SelectedMS:
     fields: dict[int, dict]
     observatory: str
     position: dict
+    start_s: float
 
 
 def select_data(selection):
@@ -163,6 +165,7 @@ def _describe(number, name, column, rows, channels, notes):
         description = tb.getcol("DATA_DESC_ID")[rows]
         field_ids = np.unique(tb.getcol("FIELD_ID")[rows])
         observation = int(tb.getcell("OBSERVATION_ID", int(rows[0])))
+        start_s = float(tb.getcell("TIME", int(rows[0])))
         for first in (int(rows[description == dd][0]) for dd in np.unique(description)):
             if not tb.iscelldefined(column, first):
                 raise ValueError(f"the {column} column of '{name}' is empty at row {first}")
@@ -195,6 +198,7 @@ def _describe(number, name, column, rows, channels, notes):
             fields={int(field): md.phasecenter(int(field)) for field in field_ids},
             observatory=md.observatorynames()[observation],
             position=_position(md, observation),
+            start_s=start_s,
         )
 
 
