@@ -10,6 +10,7 @@ from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPE
 
 __all__ = ["Schedule", "band_noise", "solve"]
 
+SHRINK = 0.9  # of κ with every re-weighting: long steps first, fine ones at the end
 RISE = 1.05  # of the residual norm within one interval, from its least
 STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
@@ -190,6 +191,7 @@ def _reweight(ppd, bounds, weight_sums, scale):
     ppd.dictionary.reweight(ppd.model, scale * noise, ppd.l1_weights)
     for band, level in zip(ppd.dictionary.bands(), noise):
         ppd.l1_weights[band.slice] *= ppd.l1_weights.dtype.type(max(level / pixel, 1.0))
+    ppd.rescale(SHRINK * ppd.threshold)
     bounds.apply_to(ppd)
 
 
