@@ -23,6 +23,8 @@ from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sor
 
 __all__ = ["Result", "make_image"]
 
+FEWEST_PIXELS = 3.0  # of the finest fringe
+LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
 IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
 
 
@@ -53,6 +55,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     """
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    data.notes.extend(_limits(data, grid))
     for note in data.notes:
         log.warn(note)
     plane = define_image_plane(data, selection, grid)
@@ -82,6 +85,21 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         write_model_column(selection, data.phase_center, lambda uvw: MeasurementOperator(
             uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads).forward(model))
     return Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
+
+
+def _limits(data, grid):
+    """What the user should know of this image plane and these baselines."""
+    notes = []
+    arcsec = np.degrees(grid.cell_rad[0]) * 3600
+    pixels = 1 / (data.max_uv * max(grid.cell_rad))
+    if pixels < FEWEST_PIXELS:
+        notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below {FEWEST_PIXELS:g} "
+                     f"sources between pixels cannot be represented; 5 would be cell = '{arcsec * pixels / 5:.3g}arcsec'")
+    corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
+    phase = np.pi * data.max_w * corner_sq
+    if phase > LARGEST_W_PHASE:
+        notes.append(f"the w-term is not modelled: it turns phases by up to {phase:.2g} rad in the corners of this image")
+    return notes
 
 
 def _solve(data, offsets, density, grid, options, noise, start):

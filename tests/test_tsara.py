@@ -94,6 +94,7 @@ def test_the_dictionary_is_tcleans_with_a_sara_record(run):
     for block in sara["blocks"]:
         assert block["noise_found"] == pytest.approx(1.0, rel=0.1)  # thermal noise, right weights
         assert block["noise_measured"] == pytest.approx(1.0, rel=0.1)
+    assert set(sara["chosen"]) == set(sara["why"])
     assert sara["history"]["iteration"].size == result["iterdone"]
     assert sara["bounds"][0]["iteration"] == 0 and len(sara["reweightings"]) > 3
 
@@ -230,6 +231,14 @@ def test_ctrl_c_ends_with_the_best_image_so_far(vis, tmp_path, monkeypatch):
     result = tsara(vis=vis, imagename=str(tmp_path / "stopped"), **GRID)
     assert (result["stopcode"], result["iterdone"]) == (STOPPED_BY_USER, 12)
     assert _pixels(str(tmp_path / "stopped.model")).sum() > 0.5
+
+
+def test_coarse_cells_and_large_w_are_pointed_out(vis, tmp_path):
+    result = tsara(vis=vis, imagename=str(tmp_path / "coarse"), niter=0, imsize=2000, cell="1arcsec", datacolumn="data")
+    assert any("cell = '1arcsec'" in note and "5 would be" in note for note in result["sara"]["notes"])
+    assert any("w-term" in note for note in result["sara"]["notes"])
+    fine = tsara(vis=vis, imagename=str(tmp_path / "fine"), niter=0, **GRID)
+    assert fine["sara"]["notes"] == []
 
 
 def test_corrected_column_absent_is_said_loudly(vis, tmp_path):

@@ -11,6 +11,14 @@ from casa_sara.solver.record import ITERATION_LIMIT, STOP_DESCRIPTIONS
 
 __all__ = ["summary"]
 
+WHY = {
+    "threshold_jy_per_pixel": "kappa of the last iteration: starts at 0.05 of the mean brightness of the NNLS image, "
+    "shrinks with every re-weighting, is halved where the residual rises; sets the pace only",
+    "noise_jy_per_beam": "of the naturally weighted dirty image, from the weights and the noise levels found",
+    "data_norm_sq": "largest eigenvalue of the preconditioned normal operator, by Lanczos iterations",
+    "regscale": "as given; 1 weighs the prior at the noise of one coefficient of the gradient of the data",
+}
+
 
 def summary(result, options, full: bool = False) -> dict[str, Any]:
     """Return the outcome of a run.
@@ -64,6 +72,7 @@ def _sara(result, options, full):
             "data_norm_sq": solved.data_norm_sq,
             "regscale": options.regscale,
         }
+        sara["why"] = dict(WHY)
         sara["reweightings"] = [dict(update) for update in record.reweightings]
         sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds} for iteration, bounds in record.bounds]
         if full:
