@@ -19,6 +19,7 @@ from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
 from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sort_into_blocks
 
 __all__ = ["Result", "make_image"]
@@ -116,7 +117,8 @@ def _solve(data, offsets, density, grid, options, noise, start):
         reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped)
     progress.close()
     record = reconstruction.record
-    log.info(f"{record.stop_description} after {record.iteration[-1]} iterations and {record.reweighting[-1]} re-weightings")
+    say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
+    say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: l2 bound {bound:.5g}, residual {norm:.5g} (whitened)")
     return reconstruction

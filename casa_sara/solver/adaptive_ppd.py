@@ -111,7 +111,7 @@ class AdaptivePPD:
         dtype = self.model.dtype.type
         change, norm = kernels.primal_step(self.model, self.model_bar, self._data_gradient, self._prior_gradient,
                                            dtype(self.tau), dtype(self.l2_step), self.positivity)
-        self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else (0.0 if change == 0 else np.inf)
+        self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
         self.iteration += 1
 
     def _data_step(self, j, start, stop):

@@ -14,8 +14,8 @@ SHRINK = 0.9  # of κ with every re-weighting: long steps first, fine ones at th
 RISE = 1.05  # of the residual norm within one interval, from its least
 STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
-
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
+LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
 
@@ -168,8 +168,8 @@ def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
         steady = not last or _is_steady(record.residual_norm[start:], schedule.interval)
         if done > 1 and settled and steady and bounds.met_by(ppd):
             return CONVERGED
-        if settled >= PATIENCE:
-            return UNFEASIBLE
+        if settled >= PATIENCE or done >= LONGEST * schedule.interval:
+            return CONVERGED if bounds.met_by(ppd) else UNFEASIBLE
 
 
 def _first_weights(ppd, bounds, weight_sums):

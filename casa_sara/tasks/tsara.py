@@ -354,7 +354,8 @@ class _tsara:
     -------
     dict
       As tclean's: iterdone, niter, nmajordone, stopcode, stopDescription, summarymajor,
-      summaryminor. Stop codes of tsara begin at 101. The key 'sara' holds its own record: the
+      summaryminor. Stop codes: 101 converged, 102 iteration limit, 103 noise only, 104 stopped by
+      user, 105 diverged, 106 converged but the data do not fit the bounds. The key 'sara' holds its own record: the
       bound of each block with its snapshot, the history of re-weightings and iterations, the
       parameters that were chosen automatically and why, and how many samples were dropped for
       which reason.
