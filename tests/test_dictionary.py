@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import pywt
 
-from casa_sara.operators import _simd, _wavelet_kernels
+from casa_sara.operators import _simd, _wavelet_kernels, _wavelet_lines
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.options import SARA_BASES
 
@@ -249,6 +249,6 @@ def test_bad_arrays():
 
 
 def test_cached_code_knows_its_source():
-    """Numba's cache watches _wavelet_kernels.py only; its SIMD_SOURCE makes it change together with _simd.py."""
-    digest = hashlib.sha256(Path(_simd.__file__).read_bytes()).hexdigest()[:12]
-    assert _wavelet_kernels.SIMD_SOURCE == digest, f"set SIMD_SOURCE = {digest!r}"
+    """Numba's cache watches _wavelet_kernels.py only; SOURCE there makes it change together with the other files."""
+    digest = hashlib.sha256(b"".join(Path(module.__file__).read_bytes() for module in (_simd, _wavelet_lines)))
+    assert _wavelet_kernels.SOURCE == digest.hexdigest()[:12], f"set SOURCE = {digest.hexdigest()[:12]!r}"

@@ -18,7 +18,7 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 
 __all__ = ["VECTOR_BYTES", "MAX_TAPS", "Vector", "filter_bank", "load", "load_first", "store", "store_first",
-           "splat", "minimum", "maximum", "evens", "odds", "zip_low", "zip_high"]
+           "prefetch", "splat", "lane_bytes", "minimum", "maximum", "evens", "odds", "zip_low", "zip_high"]
 
 MAX_TAPS = 16
 INT, LANE = ir.IntType(64), ir.IntType(32)
@@ -109,6 +109,25 @@ def splat(typingctx, scalar):
     """Vector with `scalar` in every lane."""
     vec = Vector(scalar)
     return vec(scalar), lambda context, builder, sig, args: _splat(builder, args[0], vec.llvm)
+
+
+@intrinsic
+def prefetch(typingctx, address):
+    """Ask for the cache line at `address`, which need not exist."""
+    def codegen(context, builder, sig, args):
+        pointer = builder.inttoptr(args[0], ir.IntType(8).as_pointer())
+        hints = [ir.Constant(LANE, hint) for hint in (0, 2, 1)]  # to read; into the second-level cache; data
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(ir.VoidType(), [pointer.type, *[LANE] * 3]), "llvm.prefetch.p0")
+        builder.call(function, [pointer, *hints])
+        return context.get_dummy_value()
+    return types.void(types.intp), codegen
+
+
+@intrinsic
+def lane_bytes(typingctx, vector):
+    """Bytes of one lane of a vector."""
+    return types.intp(vector), lambda context, builder, sig, args: ir.Constant(INT, vector.size)
 
 
 def _binary(build):

@@ -131,16 +131,16 @@ class SaraDictionary:
     def analysis(self, image, out=None):
         """Return Ψ† image, an array of `coef_shape`, in `out` where given."""
         out = self.allocate() if out is None else self._checked(out, "out", self.coef_shape)
-        self._analyse(image, kernels.Target(out, out, self._params, kernels.KEEP))
+        self._analyse(image, self._job(out, kernels.KEEP))
         return out
 
     def synthesis(self, coefs, out=None):
         """Return the image Ψ coefs, in `out` where given."""
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
-        target = kernels.Target(coefs, coefs, self._params, kernels.KEEP)
-        self._workers.run(kernels.transform_deeper, self._filters, target, self._work, False, True)
-        self._synthesise(target, out)
+        job = self._job(coefs, kernels.KEEP)
+        self._workers.run(kernels.transform_deeper, job, False, True)
+        self._workers.run(kernels.synthesise_finest, out, job)
         return out
 
     def dual_step(self, model_bar, dual, threshold, weights=None, out=None):
@@ -176,12 +176,11 @@ class SaraDictionary:
             raise ValueError(f"threshold={threshold} must not be negative")
         self._params[:] = np.reshape(threshold, (-1, 1, 1))
         if weights is None:
-            weights, mode = dual, kernels.CLIP
+            job = self._job(dual, kernels.CLIP)
         else:
-            weights, mode = self._checked(weights, "weights", self.coef_shape), kernels.CLIP_WEIGHTED
-        target = kernels.Target(dual, weights, self._params, mode)
-        self._analyse(model_bar, target, back=True)
-        self._synthesise(target, out)
+            job = self._job(dual, kernels.CLIP_WEIGHTED, self._checked(weights, "weights", self.coef_shape))
+        self._analyse(model_bar, job, back=True)
+        self._workers.run(kernels.synthesise_finest, out, job)
         return out
 
     def reweight(self, image, alpha, out):
@@ -196,7 +195,7 @@ class SaraDictionary:
             raise ValueError(f"alpha must be positive in every band, its minimum is {np.min(alpha)}")
         for band, value in zip(bands, alpha):
             self._params[band.basis, max(band.level, 1) - 1, ORIENTATIONS.index(band.orientation)] = value
-        self._analyse(image, kernels.Target(out, out, self._params, kernels.REWEIGHT))
+        self._analyse(image, self._job(out, kernels.REWEIGHT))
         return out
 
     def _checked(self, array, name, shape):
@@ -205,13 +204,14 @@ class SaraDictionary:
             raise ValueError(f"{name} must be a C-contiguous {self.dtype} array of shape {shape}")
         return array
 
-    def _analyse(self, image, target, back=False):
-        image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
-        self._workers.run(kernels.analyse_finest, image, self._filters, target, self._work)
-        self._workers.run(kernels.transform_deeper, self._filters, target, self._work, True, back)
+    def _job(self, coefs, mode, weights=None):
+        target = kernels.Target(coefs, coefs if weights is None else weights, self._params, mode)
+        return kernels.Job(self._filters, target, self._work)
 
-    def _synthesise(self, target, out):
-        self._workers.run(kernels.synthesise_finest, out, self._filters, target, self._work)
+    def _analyse(self, image, job, back=False):
+        image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
+        self._workers.run(kernels.analyse_finest, image, job)
+        self._workers.run(kernels.transform_deeper, job, True, back)
 
 
 def _aligned(shape, dtype):

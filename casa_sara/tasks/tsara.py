@@ -263,10 +263,10 @@ class _tsara:
 
     databound : {'adapt', 'weights', 'fixed'}, default 'adapt'
         The norm of the residual of each block of data is kept below a bound:
-          'adapt'    start from what the weights say, and from a first fit, and follow the residual
-                     where it settles elsewhere, up or down. Right where weights are only relative
+          'adapt'    start from a positive least-squares fit and follow the residual where it settles
+                     elsewhere, up or down, but not below the noise that successive integrations show. Right where weights are only relative
                      or calibration errors exceed the thermal noise.
-          'weights'  what the weights say, held fixed. Right where the weights are the true inverse
+          'weights'  what the weights say (chi-square and two standard deviations), held fixed. Right where the weights are the true inverse
                      variances and calibration errors are negligible.
           'fixed'    multiples of what the weights say, given by l2bound.
 
