@@ -158,7 +158,8 @@ def main():
         for n in options.threads:
             step, theirs = times["plain", n], times["pywt", n]
             floors = 1e3 * moved / rates[n][0], 1e3 * filter_flops(shape, dictionary.wavelets) / rates[n][1]
-            spread = [f"{1e3 * t[0]:.1f} ({1e3 * t[1]:.1f}–{1e3 * t[2]:.1f})" for t in (step, times["weighted", n], theirs)]
+            spread = [f"{1e3 * t[0]:.1f} ({1e3 * t[1]:.1f}–{1e3 * t[2]:.1f})"
+                      for t in (step, times["weighted", n], theirs)]
             print(f"| {size} | {n} | {' | '.join(spread)} | {theirs[0] / step[0]:.0f} "
                   f"| {times['pywt', options.threads[0]][0] / step[0]:.0f} | {floors[0]:.1f} ms | {floors[1]:.1f} ms "
                   f"| {1e3 * step[0] / max(floors):.1f} |", flush=True)

@@ -58,6 +58,14 @@ def test_the_multiplier_does_not_depend_on_the_first_guess(guess):
     assert ellipsoid_multiplier(zero, point, centre, precond, 0.1, guess) == pytest.approx(expected, rel=1e-9)
 
 
+def test_newton_takes_a_few_steps(monkeypatch):
+    point, centre, precond = _case(np.random.default_rng(8), 2000, 6)
+    calls, plain = [], kernels.shifted_norms
+    monkeypatch.setattr(kernels, "shifted_norms", lambda *args: calls.append(1) or plain(*args))
+    ellipsoid_multiplier(np.zeros_like(centre), point, centre, precond, 1.0)
+    assert len(calls) <= 12
+
+
 def test_the_dual_update_is_moreaus_complement_of_the_projection():
     rng = np.random.default_rng(5)
     point, centre, precond = _case(rng, 80, 3)

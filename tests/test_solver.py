@@ -119,10 +119,12 @@ def test_residual_norms_are_those_of_the_model_before_the_step():
     np.testing.assert_allclose(ppd.residual_norms, expected, rtol=1e-10)
 
 
-def test_rescaling_the_threshold_leaves_the_fixed_point():
+@pytest.mark.parametrize("hard", [True, False])
+def test_rescaling_the_threshold_leaves_the_fixed_point(hard):
     problem = Problem(seed=7)
     ppd = _ppd(problem)
-    converged = _run(ppd, _given(problem, 1.05 * problem.errors), 20_000).copy()
+    levels = AdaptiveBounds(problem.errors, np.diff(problem.offsets), np.ones(2), 3, rel_change=0.0)
+    converged = _run(ppd, _given(problem, 1.05 * problem.errors) if hard else levels, 20_000).copy()
     ppd.rescale(0.01)
     for _ in range(20):
         ppd.step()

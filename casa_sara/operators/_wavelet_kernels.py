@@ -106,7 +106,7 @@ def _analyse(source, origin, b, level, begin, end, job, worker):
     pixels = (first + line - size, first) if start % 2 else (first, first + line)  # a filter begins on an odd pixel
     for r in range(begin, end, 2):
         tabulate(table, 1, _address(source, ZERO), source.shape[1] * size, 2 * r + start - origin, source.shape[0],
-                  length + 2)
+                 length + 2)
         place = Place(_address(coefs, r), _address(weights, r), right, down)
         analyse_lines(table, line_taps, length, phases, line, place, step)
         wrap(scratch, right // size)
