@@ -140,7 +140,7 @@ def test_noise_alone_gives_an_almost_empty_image_and_says_so(copy, tmp_path):
 @pytest.mark.parametrize("databound", ["weights", "fixed"])
 def test_given_bounds_are_met(vis, tmp_path, databound):
     extra = dict(l2bound=[1.0]) if databound == "fixed" else {}
-    result = tsara(vis=vis, imagename=str(tmp_path / "bounds"), databound=databound, nreweights=3, **extra, **GRID)
+    result = tsara(vis=vis, imagename=str(tmp_path / "bounds"), databound=databound, **extra, **GRID)
     assert result["stopcode"] == CONVERGED
     for block in result["sara"]["blocks"]:
         degrees = 2 * block["samples"]

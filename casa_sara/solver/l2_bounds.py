@@ -96,8 +96,8 @@ class GivenBounds(_NoiseLevels):
         return False
 
     def met_by(self, ppd):
-        """Whether every block's residual is inside its bound, but for a relative 5e-3."""
-        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 5e-3)))
+        """Whether every block's residual is inside its bound, but for a relative 1e-3."""
+        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3)))
 
 
 @dataclass
