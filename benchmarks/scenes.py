@@ -1,9 +1,7 @@
-"""Simulated observations for studies: the skies of ../shared/data and the demo's, as MeasurementSets of known truth.
+"""Simulated observations for studies: the skies of ../shared/data and our own, as MeasurementSets of known truth.
 
-    simulation = observe("M31", folder, noise_db=30, gain_rms=0.01, seed=3)
-    simulation = observe("cyga", folder, configs="A")
-    simulation = observe("W28", folder, configs=ALMA_CONFIGS, observation=ALMA)
-    simulation = observe("3c353", folder, observation=replace(VLA, weight_scale=(0.5, 0.5, 2, 2)))
+    sky = scene_sky("M31", cell_arcsec=0.06)
+    simulation = observe(sky, folder, ARRAYS["VLA A-D"], noise_db=30, gain_rms=0.01, seed=3)
 
 `simulation.vis`, `.truth`, `.cell_arcsec` and `.blocks` (true noise and error norms of every snapshot) are all a
 study needs.
@@ -12,7 +10,7 @@ study needs.
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,44 +18,112 @@ from astropy.io import fits
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from casa_sara.demo.simulate import Observation, Simulation, simulate_observation
+from casa_sara.analysis.metrics import smooth
+from casa_sara.demo.simulate import SPEED_OF_LIGHT, Observation, Simulation, antennas, simulate_observation
 from casa_sara.demo.sky import ARCSEC, Sky, cyg_a_like
 
-__all__ = ["SKIES", "VLA", "ALMA", "ALMA_CONFIGS", "reference_sky", "observe", "replace"]
+__all__ = ["ARRAYS", "SCENES", "Array", "nominal_cell_arcsec", "observe", "replace", "scene_sky", "smoothed_truth"]
 
 DATA = Path(__file__).resolve().parents[2] / "shared/data/skies"
 FLUX_JY = 10.0
+SIZE = 256
 
-# file and background to subtract
-SKIES = {
-    "M31": ("M31_256.fits", 0.0),
-    "W28": ("W28_256.fits", 0.0),
-    "30dor": ("30dor_256.fits", 2.6),
-    "3c353": ("3c353_512.fits", 0.0),
-    "3c295": ("3c295_512.fits", 0.0),
-    "3c196": ("3c196_512.fits", 0.0),
+# file, background to subtract, and how its pixels become 256²: 'all', the 'centre', or 'bin'ned by 2
+REFERENCE = {
+    "M31": ("M31_256.fits", 0.0, "all"),
+    "W28": ("W28_256.fits", 0.0, "all"),
+    "30dor": ("30dor_256.fits", 2.6, "all"),
+    "3c353": ("3c353_512.fits", 0.0, "bin"),
+    "3c295": ("3c295_512.fits", 0.0, "centre"),
+    "3c196": ("3c196_512.fits", 0.0, "centre"),
 }
+SCENES = ("cyga", *REFERENCE, "points on pixels", "points off pixels")
+
+
+@dataclass(frozen=True)
+class Array:
+    """A telescope with the configurations it observes in, one after the other."""
+
+    observation: Observation
+    configs: tuple[str, ...]
+
 
 VLA = Observation()
-ALMA_CONFIGS = ("alma.cycle8.3", "alma.cycle8.6")
 ALMA = Observation(
     telescope="ALMA", antenna_file="alma/simmos/{}.cfg", source="target", direction=("15h00m00.0s", "-30d00m00.0s"),
-    freq_hz=230e9, channel_hz=500e6, correlations="XX YY", hour_angles=(-2.0, 2.0), integrations=2, integration_s=30.0,
+    freq_hz=230e9, channel_hz=500e6, correlations="XX YY", hour_angles=(-0.5, 0.5), scans=1, integrations=8,
+    integration_s=30.0,
 )  # fmt: skip
+ARRAYS = {
+    "VLA A-D": Array(VLA, tuple("ABCD")),
+    "VLA A": Array(VLA, ("A",)),
+    "VLA C": Array(VLA, ("C",)),
+    "ALMA snapshot": Array(ALMA, ("alma.cycle8.5",)),
+}
 
 
-def reference_sky(name: str, cell_arcsec: float = 0.06, flux_jy: float = FLUX_JY) -> Sky:
-    """Return a reference sky on its own pixels, scaled to a total flux; 'cyga' is the demo's."""
+def nominal_cell_arcsec(array: Array) -> float:
+    """Return the pixel size of the nominal resolution, 1/(2B) with B the longest baseline in wavelengths."""
+    longest = 0.0
+    for config in array.configs:
+        (x, y, z, _), _, _ = antennas(array.observation, config)
+        longest = max(longest, *(np.hypot(np.hypot(x - x[i], y - y[i]), z - z[i]).max() for i in range(x.size)))
+    return 0.5 * SPEED_OF_LIGHT / array.observation.freq_hz / longest / ARCSEC
+
+
+def scene_sky(name: str, cell_arcsec: float = 0.06, flux_jy: float = FLUX_JY) -> Sky:
+    """Return a scene on pixels of `cell_arcsec`, scaled to a total flux; 'cyga' is the demo's."""
     if name == "cyga":
-        return cyg_a_like(cell_arcsec=cell_arcsec)
-    file, background = SKIES[name]
+        return replace(cyg_a_like(), cell_rad=cell_arcsec * ARCSEC / 2)
+    if name.startswith("points"):
+        return _points(cell_arcsec, flux_jy, on_pixels=name.endswith("on pixels"))
+    file, background, how = REFERENCE[name]
     image = np.clip(fits.getdata(DATA / file).squeeze().T.astype(float) - background, 0, None)
+    if how == "centre":
+        first = (image.shape[0] - SIZE) // 2
+        image = image[first : first + SIZE, first : first + SIZE]
+    elif how == "bin":
+        image = image.reshape(SIZE, 2, SIZE, 2).sum(axis=(1, 3))
     return Sky(image * (flux_jy / image.sum()), cell_arcsec * ARCSEC)
 
 
-def observe(
-    name: str, folder: str | Path, configs="ABCD", noise_db=35.0, gain_rms=0.0, seed=0, observation: Observation = VLA
-) -> Simulation:
+def _points(cell_arcsec, flux_jy, on_pixels, number=60, seed=77):
+    """Unresolved sources over three decades of brightness, and as much flux again in extended emission below them."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(*[np.arange(SIZE) - SIZE // 2] * 2, indexing="ij")
+    extended = np.zeros((SIZE, SIZE))
+    for _ in range(25):
+        (cx, cy), width = rng.normal(0, 30, 2), rng.uniform(5, 18)
+        extended += rng.exponential() * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * width**2)) / width
+    fluxes = 10 ** -np.linspace(0, 3, number)
+    places = rng.uniform(-0.4, 0.4, (number, 2)) * SIZE
+    if on_pixels:
+        places = np.rint(places)
+    points = np.column_stack([places * cell_arcsec * ARCSEC, fluxes * (0.5 * flux_jy / fluxes.sum())])
+    return Sky(extended * (0.5 * flux_jy / extended.sum()), cell_arcsec * ARCSEC, points=points)
+
+
+def smoothed_truth(sky: Sky, fwhm, position_angle_deg=0.0) -> np.ndarray:
+    """Return the sky convolved with a Gaussian, its point sources at their places between the pixels, in Jy/pixel.
+
+    Parameters are those of :func:`casa_sara.analysis.metrics.smooth`, in pixels of the truth.
+    """
+    smoothed = smooth(replace(sky, points=sky.points[:0]).truth(), fwhm, position_angle_deg)
+    nx, ny = smoothed.shape
+    cell = sky.cell_rad * sky.oversampling
+    major, minor = np.broadcast_to(fwhm, 2)
+    sin, cos = np.sin(np.deg2rad(position_angle_deg)), np.cos(np.deg2rad(position_angle_deg))
+    for l, m, flux in sky.points:
+        east = -(np.arange(nx) - nx // 2)[:, None] - l / cell
+        north = (np.arange(ny) - ny // 2)[None, :] - m / cell
+        along, across = north * cos + east * sin, east * cos - north * sin
+        exponent = -4 * np.log(2) * ((along / major) ** 2 + (across / minor) ** 2)
+        smoothed += flux * 4 * np.log(2) / (np.pi * major * minor) * np.exp(exponent)
+    return smoothed
+
+
+def observe(sky: Sky, folder: str | Path, array: Array = ARRAYS["VLA A-D"], noise_db=35.0, gain_rms=0.0,
+            seed=1) -> Simulation:
     """Simulate an observation of a sky into a new or empty folder."""
     Path(folder).mkdir(parents=True, exist_ok=True)
-    return simulate_observation(folder, reference_sky(name), configs, noise_db, gain_rms, seed, observation)
+    return simulate_observation(folder, sky, array.configs, noise_db, gain_rms, seed, array.observation)

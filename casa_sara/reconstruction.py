@@ -17,7 +17,7 @@ from casa_sara.solver.reweighting import Schedule, solve
 
 __all__ = ["Reconstruction", "reconstruct", "schedule_of"]
 
-STEP_BALANCE = 0.05  # κ in units of the mean brightness Σx²/Σ|x| of the first model
+STEP_BALANCE = 0.1  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 

@@ -52,15 +52,15 @@ class DenseDictionary:
         out[...] = self.matrix @ image.ravel()
         return out
 
-    def dual_step(self, model_bar, dual, threshold, weights=None, out=None):
+    def dual_step(self, model_bar, dual, threshold, weights=None, out=None, relaxation=1.0):
         limit = threshold * (1.0 if weights is None else weights)
-        dual[...] = np.clip(dual + self.matrix @ model_bar.ravel(), -limit, limit)
+        dual += relaxation * (np.clip(dual + self.matrix @ model_bar.ravel(), -limit, limit) - dual)
         out[...] = (self.matrix.T @ dual).reshape(self.shape)
         return out
 
-    def reweight(self, image, alpha, out):
-        for band, value in zip(self.bands(), alpha):
-            out[band.slice] = value / (value + np.abs(self.matrix[band.slice] @ image.ravel()))
+    def reweight(self, image, alpha, scale, out):
+        for band, value, factor in zip(self.bands(), alpha, scale):
+            out[band.slice] = factor * value / (value + np.abs(self.matrix[band.slice] @ image.ravel()))
         return out
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import pywt
+from scipy import ndimage
 
 from casa_sara.operators import _simd, _wavelet_kernels, _wavelet_lines
 from casa_sara.operators.dictionary import SaraDictionary
@@ -86,21 +87,22 @@ def test_parseval_frame(shape):
     np.testing.assert_allclose(dictionary.synthesis(forth), image, atol=1e-13)
 
 
-@pytest.mark.parametrize("weighted", [False, True])
+@pytest.mark.parametrize("weighted, relaxation", [(False, 1.0), (True, 1.0), (True, 1.7)])
 @pytest.mark.parametrize("threshold", [0.3, tuple(np.linspace(0.0, 0.4, 9))], ids=["scalar", "per basis"])
 @pytest.mark.parametrize("shape", SHAPES, ids=str)
-def test_dual_step(shape, threshold, weighted):
+def test_dual_step(shape, threshold, weighted, relaxation):
     dictionary = make(shape, dtype=np.float64)
     image, before = noise(shape), 0.2 * noise(dictionary.coef_shape, seed=1)
     weights = np.random.default_rng(2).uniform(0, 2, dictionary.coef_shape) if weighted else None
     dual = before.copy()
-    out = dictionary.dual_step(image, dual, np.array(threshold), weights, noise(shape, seed=3))
+    out = dictionary.dual_step(image, dual, np.array(threshold), weights, noise(shape, seed=3), relaxation)
 
     u = before + oracle_analysis(dictionary, image)
     limit = np.reshape(threshold, (-1, 1, 1)) * (1 if weights is None else weights)
     soft = np.sign(u) * np.maximum(np.abs(u) - limit, 0)
-    np.testing.assert_allclose(dual, u - soft, atol=1e-13)
-    np.testing.assert_allclose(out, oracle_synthesis(dictionary, u - soft), atol=1e-13)
+    expected = (1 - relaxation) * before + relaxation * (u - soft)
+    np.testing.assert_allclose(dual, expected, atol=1e-13)
+    np.testing.assert_allclose(out, oracle_synthesis(dictionary, expected), atol=1e-13)
 
 
 def test_single_precision():
@@ -124,7 +126,7 @@ def test_threads_change_no_bit(shape):
     results = []
     for nthreads in (1, 2, 3, 11):
         dictionary = make(shape, nthreads=nthreads)
-        weights = dictionary.reweight(image, 0.1, out=dictionary.allocate())
+        weights = dictionary.reweight(image, 0.1, 1.0, out=dictionary.allocate())
         dual = dictionary.allocate() + np.float32(0.01)
         out = dictionary.dual_step(image, dual, 0.2, weights)
         results.append(np.concatenate([weights.ravel(), dual.ravel(), out.ravel()]))
@@ -157,15 +159,17 @@ def test_band_orientation():
     assert max(energy.values()) < 1e-20
 
 
-@pytest.mark.parametrize("shape", [(37, 20), (64, 64)], ids=str)
+@pytest.mark.parametrize("shape", [(37, 20), (64, 64), (1, 1), (40, 3)], ids=str)
 def test_reweight(shape):
+    """Against a 3×3 mean filter of scipy's, down to bands of one row or one column."""
     dictionary = make(shape, dtype=np.float64)
     image, bands = noise(shape), dictionary.bands()
-    alpha = np.random.default_rng(1).uniform(0.1, 1, len(bands))
-    weights = dictionary.reweight(image, alpha, out=noise(dictionary.coef_shape))
+    alpha, scale = np.random.default_rng(1).uniform(0.1, 1, (2, len(bands)))
+    weights = dictionary.reweight(image, alpha, scale, out=noise(dictionary.coef_shape))
     coefs = oracle_analysis(dictionary, image)
-    for band, value in zip(bands, alpha):
-        np.testing.assert_allclose(weights[band.slice], value / (value + np.abs(coefs[band.slice])), rtol=1e-11)
+    for band, value, factor in zip(bands, alpha, scale):
+        around = np.sqrt(ndimage.convolve(coefs[band.slice] ** 2, np.full((3, 3), 1 / 9), mode="wrap"))
+        np.testing.assert_allclose(weights[band.slice], factor * value / (value + around), rtol=1e-11)
 
 
 def test_nothing_is_allocated():
@@ -176,7 +180,7 @@ def test_nothing_is_allocated():
     def everything():
         dictionary.analysis(image, dual)
         dictionary.synthesis(dual, out)
-        dictionary.reweight(image, 0.1, weights)
+        dictionary.reweight(image, 0.1, 1.0, weights)
         dictionary.dual_step(image, dual, 0.1, weights, out)
 
     everything()
@@ -245,7 +249,7 @@ def test_bad_arrays():
     with pytest.raises(ValueError, match="threshold"):
         dictionary.dual_step(image, coefs, -0.1)
     with pytest.raises(ValueError, match="alpha"):
-        dictionary.reweight(image, 0.0, coefs)
+        dictionary.reweight(image, 0.0, 1.0, coefs)
 
 
 def test_cached_code_knows_its_source():

@@ -12,10 +12,10 @@ from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER,
 from casa_sara.solver.reweighting import Schedule, solve
 
 
-def _ppd(problem, precond=None, threshold=0.2):
+def _ppd(problem, precond=None, threshold=0.2, **options):
     precond = problem.precond if precond is None else precond
     ppd = AdaptivePPD(problem.measurement, problem.dictionary, problem.vis, problem.offsets, precond,
-                      problem.data_norm_sq(precond))
+                      problem.data_norm_sq(precond), **options)
     ppd.rescale(threshold)
     return ppd
 
@@ -81,6 +81,16 @@ def test_neither_preconditioner_nor_threshold_moves_the_constrained_minimiser():
     with_precond = _run(_ppd(problem, threshold=0.05), _given(problem, bounds), 20_000)
     without = _run(_ppd(problem, np.ones_like(problem.precond)), _given(problem, bounds), 100_000)
     np.testing.assert_allclose(with_precond, without, atol=3e-4 * without.max())
+
+
+def test_relaxation_moves_no_fixed_point_and_saves_iterations():
+    problem = Problem(seed=4)
+    given = _given(problem, 1.05 * problem.errors)
+    converged = _run(_ppd(problem), given, 20_000).copy()
+    ppd = _ppd(problem, relaxation=1.0)
+    np.testing.assert_allclose(_run(ppd, given, 40_000), converged, atol=1e-6 * converged.max())
+    errors = [np.linalg.norm(_run(_ppd(problem, relaxation=rho), given, 2000) - converged) for rho in (1.0, 1.8)]
+    assert errors[1] < 0.7 * errors[0]
 
 
 def test_given_noise_levels_the_iteration_reaches_the_penalised_minimiser():

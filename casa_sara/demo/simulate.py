@@ -7,7 +7,7 @@ noise agrees with SIGMA and WEIGHT, and everything that was added is kept for co
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from casatools import ctsys, measures, simulator, table
 from casa_sara.demo.predict import predict
 from casa_sara.demo.sky import ARCSEC, Sky
 
-__all__ = ["Observation", "Block", "Simulation", "simulate_observation"]
+__all__ = ["Block", "Observation", "Simulation", "antennas", "simulate_observation"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 
@@ -36,6 +36,9 @@ class Observation:
     noise_scale, weight_scale : tuple of float
         For each configuration, a factor on its noise, and one on its WEIGHT that the noise does not
         follow (wrong weights); empty for ones.
+    pointing_rms : float
+        Pointing errors, a direction-dependent error: the gain of each antenna in each scan grows linearly
+        across the image, by this much (rms) from its centre to its edge, independently along both axes.
     """
 
     telescope: str = "VLA"
@@ -52,6 +55,7 @@ class Observation:
     integration_s: float = 10.0
     noise_scale: tuple[float, ...] = ()
     weight_scale: tuple[float, ...] = ()
+    pointing_rms: float = 0.0
 
     @property
     def phasecenter(self) -> str:
@@ -68,8 +72,8 @@ class Observation:
 class Block:
     """One snapshot (a scan of one MeasurementSet) and the norms of what its Stokes I samples hold.
 
-    All norms are of whitened samples, √w·V with w = 4/(1/w_RR + 1/w_LL) from the WEIGHT column:
-    of the true visibilities, of the noise, of the gain errors, and of noise and gain errors together.
+    All norms are of whitened samples, √w·V with w = 4/(1/w_RR + 1/w_LL) from the WEIGHT column: of the true
+    visibilities, of the noise, of the gain errors (pointing errors among them), and of noise and gain errors together.
     """
 
     ms: str
@@ -171,6 +175,9 @@ class _Rows:
         inverse_wavelength = observation.channel_freqs_hz / SPEED_OF_LIGHT
         uvw = (uvw_m[:, None, :] * inverse_wavelength[:, None]).reshape(3, -1)
         self.signal = predict(sky, uvw).reshape(inverse_wavelength.size, -1)
+        self.pointing_rms = observation.pointing_rms
+        self.slopes = [] if not self.pointing_rms else [
+            predict(tilted, uvw).reshape(self.signal.shape) for tilted in _tilted(sky)]
 
     def corrupt(self, noise_std: float, weight_scale: float, gain_rms: float, seed: list[int]) -> list[Block]:
         """Write visibilities with gain errors and noise, SIGMA and WEIGHT; return what each scan got."""
@@ -179,6 +186,10 @@ class _Rows:
         gains = (1 + gain_rms * gain.standard_normal(shape)) * np.exp(1j * gain_rms * gain.standard_normal(shape))
         first, second = (gains[self.scan, antenna] for antenna in self.antennas)
         gain_error = self.signal * (first * second.conj() - 1)
+        pointing = np.random.default_rng([*seed, 3])
+        for slope in self.slopes:
+            offsets = self.pointing_rms * pointing.standard_normal(shape)
+            gain_error += slope * sum(offsets[self.scan, antenna] for antenna in self.antennas)
 
         sigma = np.sqrt(2) * noise_std  # of one hand
         draw = np.random.default_rng([*seed, 2]).standard_normal((2, 2, *self.signal.shape))
@@ -201,9 +212,21 @@ class _Rows:
         return blocks
 
 
+def _tilted(sky: Sky) -> list[Sky]:
+    """Return the sky times a gain that grows linearly from 0 at its centre to 1 at its edge, along each axis."""
+    nx, ny = sky.image.shape
+    half = nx / 2 * sky.cell_rad, ny / 2 * sky.cell_rad
+    ramps = np.meshgrid((nx // 2 - np.arange(nx)) / (nx / 2), (np.arange(ny) - ny // 2) / (ny / 2), indexing="ij")
+    return [
+        replace(sky, image=sky.image * ramp, points=sky.points * np.array([1, 1, 0]) + np.outer(
+            sky.points[:, axis] / half[axis] * sky.points[:, 2], [0, 0, 1]))
+        for axis, ramp in enumerate(ramps)
+    ]  # fmt: skip
+
+
 def _lay_out(vis: Path, config: str, phases: np.ndarray, observation: Observation) -> None:
     """Write a MeasurementSet without signal; its scans start at `phases` (0 … 1) of the range of hour angles."""
-    (x, y, z, diameter), names, system = _antennas(ctsys.resolve(observation.antenna_file.format(config.lower())))
+    (x, y, z, diameter), names, system = antennas(observation, config)
     me, sm = measures(), simulator()
     sm.open(str(vis))
     try:
@@ -231,9 +254,9 @@ def _lay_out(vis: Path, config: str, phases: np.ndarray, observation: Observatio
         sm.close()
 
 
-def _antennas(path: str) -> tuple[np.ndarray, list[str], str]:
+def antennas(observation: Observation, config: str) -> tuple[np.ndarray, list[str], str]:
     """Read a CASA antenna file: x, y, z and diameter in m (4, n), pad names, and the system of the coordinates."""
-    lines = Path(path).read_text().splitlines()
+    lines = Path(ctsys.resolve(observation.antenna_file.format(config.lower()))).read_text().splitlines()
     rows = [line.split() for line in lines if line.strip() and not line.startswith("#")]
     names = [row[4] if len(row) > 4 else f"A{number:03d}" for number, row in enumerate(rows)]
     system = "local" if any(line.startswith("#") and "coordsys=LOC" in line for line in lines) else "global"

@@ -14,15 +14,15 @@ from numba import njit
 
 from casa_sara.operators._simd import MAX_TAPS, VECTOR_BYTES
 from casa_sara.operators._wavelet_lines import (
-    CLIP, CLIP_WEIGHTED, HALO, KEEP, REWEIGHT, SCRATCH_ROWS, TABLE_SIZE, Place, analyse_along, analyse_lines, compiled,
-    late, synthesise_along, synthesise_lines, tabulate, update_pixels, wrap,
+    CLIP, CLIP_WEIGHTED, HALO, KEEP, SCRATCH_ROWS, TABLE_SIZE, Place, analyse_along, analyse_lines, compiled, late,
+    synthesise_along, synthesise_lines, tabulate, update_pixels, wrap,
 )
 
 CHUNK = 16  # lines of level 1 done in one go
 MARGIN = MAX_TAPS // 2 - 1  # image lines needed before those of a chunk
 WINDOW_ROWS = 2 * CHUNK + MAX_TAPS
 ZERO, ONE = np.int64(0), np.int64(1)  # literals would make Numba compile the callee for each
-SOURCE = "8d1048b70de9"  # digest of _simd.py and _wavelet_lines.py: the cache of compiled code watches this file only
+SOURCE = "bb9659b6ab76"  # digest of _simd.py and _wavelet_lines.py: the cache of compiled code watches this file only
 
 stage = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 
@@ -41,13 +41,14 @@ class Target(NamedTuple):
 
     coefs: np.ndarray  # (b, NX, NY)
     weights: np.ndarray  # (b, NX, NY), of meaning to CLIP_WEIGHTED only
-    params: np.ndarray  # (b, levels, 4), one per band
+    params: np.ndarray  # (b, 2): threshold κ and relaxation ρ of each basis
     mode: int
 
 
 class Work(NamedTuple):
     """Workspaces; their lines have room at the end for the last vector to overrun."""
 
+    levels: int
     approx: np.ndarray  # (b, …) approximations of all levels
     owner: np.ndarray  # (b,) worker that does the deeper levels of each basis
     window: np.ndarray  # (workers, WINDOW_ROWS, …) lines of the image
@@ -74,7 +75,7 @@ def padded_width(n, size):
 def _approx(job, b, level):
     """Approximation of basis `b` at `level` ≥ 1, with padded lines; the deepest one is in the coefficients."""
     nx, ny = job.target.coefs.shape[1:]
-    if level == job.target.params.shape[1]:
+    if level == job.work.levels:
         return job.target.coefs[b]
     size, begin = job.work.approx.itemsize, 0
     for finer in range(1, level):
@@ -98,7 +99,7 @@ def _analyse(source, origin, b, level, begin, end, job, worker):
     coefs, weights, step = target.coefs[b], target.weights[b], target.coefs.shape[2] * size
     right, down = (target.coefs.shape[2] >> level) * size, (target.coefs.shape[1] >> level) * step
     line_taps, taps = filters.analysis[1 if level == 1 else 0, b], filters.analysis[0, b]
-    approx, deepest = _approx(job, b, level), level == target.params.shape[1]
+    approx, deepest = _approx(job, b, level), level == work.levels
     scratch, table = work.scratch[worker], work.tables[worker, 0]
     line = scratch.shape[1] * size
     phases = _address(scratch, ZERO) + HALO * size
@@ -113,7 +114,7 @@ def _analyse(source, origin, b, level, begin, end, job, worker):
         for i in range(r, min(r + 2, end)):
             place = Place(_address(coefs, i), _address(weights, i), right, down)
             low = 0 if deepest else _address(approx, i)
-            analyse_along(pixels, taps, length, 4 * (i - r) * line, line, low, place, target.params[b, level - 1],
+            analyse_along(pixels, taps, length, 4 * (i - r) * line, line, low, place, target.params[b],
                           target.mode)
 
 
@@ -173,13 +174,13 @@ def analyse_finest(image, job, worker, workers):
                 continue
             for i in range(2 * begin, 2 * end):
                 place = Place(_address(target.coefs[b], i), _address(target.weights[b], i), ny * window.itemsize, ZERO)
-                update_pixels(_address(window, i - origin), place, filters.gain, target.params[b, 0, 0], target.mode)
+                update_pixels(_address(window, i - origin), place, filters.gain, target.params[b], target.mode)
 
 
 @stage
 def transform_deeper(job, forth, back, worker, workers):
     """Levels 2, 3, … of the bases this worker owns: analysis if `forth`, synthesis if `back`."""
-    levels = job.target.params.shape[1]
+    levels = job.work.levels
     for b in range(job.filters.lengths.size):
         if job.work.owner[b] != worker or job.filters.lengths[b] == 0:
             continue

@@ -21,11 +21,11 @@ from casa_sara.operators._simd import (
     store, store_first, zip_high, zip_low,
 )
 
-__all__ = ["KEEP", "CLIP", "CLIP_WEIGHTED", "REWEIGHT", "HALO", "SCRATCH_ROWS", "TABLE_SIZE", "Place", "compiled",
+__all__ = ["KEEP", "CLIP", "CLIP_WEIGHTED", "HALO", "SCRATCH_ROWS", "TABLE_SIZE", "Place", "compiled",
            "late", "tabulate", "wrap", "update_pixels", "analyse_lines", "analyse_along", "synthesise_lines",
            "synthesise_along"]
 
-KEEP, CLIP, CLIP_WEIGHTED, REWEIGHT = range(4)
+KEEP, CLIP, CLIP_WEIGHTED = range(3)
 HALO = 16  # columns before and after the values of a scratch line
 SCRATCH_ROWS = 8
 TABLE_SIZE = 2 * MAX_TAPS
@@ -81,30 +81,29 @@ def wrap(scratch, n):
 
 
 @compiled
-def _combine(old, fresh, weight, param, mode):
-    """New value of a coefficient.
+def _combine(old, fresh, weight, params, mode):
+    """New value of a coefficient, params = (κ, ρ).
 
-    KEEP: fresh;  CLIP: clip(old + fresh, ±param);  CLIP_WEIGHTED: clip(old + fresh, ±param·weight);
-    REWEIGHT: param/(param + |fresh|).
+    KEEP: fresh;  CLIP: old + ρ(clip(old + fresh, ±κ) − old);  CLIP_WEIGHTED: the same with ±κ·weight.
     """
-    zero = param - param
     if mode == KEEP:
         return fresh
-    if mode == REWEIGHT:
-        return param / (param + maximum(fresh, zero - fresh))
-    limit = param * weight if mode == CLIP_WEIGHTED else param
-    return minimum(maximum(old + fresh, zero - limit), limit)
+    limit, relaxation = params
+    if mode == CLIP_WEIGHTED:
+        limit = limit * weight
+    clipped = minimum(maximum(old + fresh, (limit - limit) - limit), limit)
+    return old + relaxation * (clipped - old)
 
 
 @compiled
-def _update(at, fresh, weight_at, param, mode, left):
+def _update(at, fresh, weight_at, params, mode, left):
     """Combine a vector of fresh coefficients, `left` bytes of it valid, into those at address `at`."""
     if left >= VECTOR_BYTES:
-        store(at, _combine(load(at, param), fresh, load(weight_at, param), param, mode))
+        store(at, _combine(load(at, fresh), fresh, load(weight_at, fresh), params, mode))
     elif left > 0:
-        lanes = left // lane_bytes(param)
-        old, weight = load_first(at, lanes, param), load_first(weight_at, lanes, param)
-        store_first(at, _combine(old, fresh, weight, param, mode), lanes)
+        lanes = left // lane_bytes(fresh)
+        old, weight = load_first(at, lanes, fresh), load_first(weight_at, lanes, fresh)
+        store_first(at, _combine(old, fresh, weight, params, mode), lanes)
 
 
 @compiled
@@ -129,7 +128,7 @@ def analyse_lines(table, taps, length, to, line, place, step):
 @compiled
 def analyse_along(pixels, taps, length, shift, line, low, place, params, mode):
     """Filter an a and a d line along themselves; the bands go to `place`, but aa to `low` if that is an address."""
-    aa, ad, da, dd = splat(params[0]), splat(params[1]), splat(params[2]), splat(params[3])
+    both = splat(params[0]), splat(params[1])
     coefs, weights, right, down = place
     for k in range(0, right, 2 * VECTOR_BYTES):
         a, d = shift + k, shift + k + 2 * line
@@ -140,11 +139,11 @@ def analyse_along(pixels, taps, length, shift, line, low, place, params, mode):
             if low:
                 store(low + at, v[2 * i])
             else:
-                _update(coefs + at, v[2 * i], weights + at, aa, mode, left)
-            _update(coefs + right + at, v[2 * i + 1], weights + right + at, ad, mode, left)
+                _update(coefs + at, v[2 * i], weights + at, both, mode, left)
+            _update(coefs + right + at, v[2 * i + 1], weights + right + at, both, mode, left)
             at += down
-            _update(coefs + at, v[2 * i + 4], weights + at, da, mode, left)
-            _update(coefs + right + at, v[2 * i + 5], weights + right + at, dd, mode, left)
+            _update(coefs + at, v[2 * i + 4], weights + at, both, mode, left)
+            _update(coefs + right + at, v[2 * i + 5], weights + right + at, both, mode, left)
 
 
 @compiled
@@ -191,8 +190,8 @@ def synthesise_along(halves, n, taps, length, shift, line, to, step, add):
 
 
 @compiled
-def update_pixels(pixels, place, gain, param, mode):
+def update_pixels(pixels, place, gain, params, mode):
     """Combine a line of pixels, times the gain, into the Dirac coefficients."""
-    gain, param = splat(gain), splat(param)
+    gain, both = splat(gain), (splat(params[0]), splat(params[1]))
     for k in range(0, place.right, VECTOR_BYTES):
-        _update(place.coefs + k, gain * load(pixels + k, gain), place.weights + k, param, mode, place.right - k)
+        _update(place.coefs + k, gain * load(pixels + k, gain), place.weights + k, both, mode, place.right - k)

@@ -15,6 +15,7 @@ import numpy as np
 import pywt
 
 from casa_sara.operators import _wavelet_kernels as kernels
+from casa_sara.operators._wavelet_weights import RING_ROWS, neighbourhood_weights
 from casa_sara.operators._workers import Workers
 from casa_sara.options import SARA_BASES
 
@@ -79,7 +80,9 @@ class SaraDictionary:
         self._filters = _filters(self.wavelets, self.dtype)
         self._workers = Workers(nthreads)
         self._work = self._workspaces()
-        self._params = np.zeros((self.n_bases, self.levels, 4), self.dtype)
+        self._params = np.zeros((self.n_bases, 2), self.dtype)
+        self._ring = np.zeros((self._workers.count, RING_ROWS, padded[1]), self.dtype)
+        self._rectangles = np.array([_rectangle(band) for band in self.bands()])
 
     def _validate(self):
         if len(self.shape) != 2 or min(self.shape) < 1:
@@ -97,7 +100,7 @@ class SaraDictionary:
         approx = sum((nx >> level) * kernels.padded_width(ny >> level, size) for level in range(1, self.levels))
         width = kernels.padded_width(ny + 2 * kernels.HALO, size)
         return kernels.Work(
-            approx=_aligned((self.n_bases, approx), self.dtype),
+            levels=self.levels, approx=_aligned((self.n_bases, approx), self.dtype),
             owner=_shares(self._filters.lengths, threads),
             window=_aligned((threads, kernels.WINDOW_ROWS, width), self.dtype),
             scratch=_aligned((threads, kernels.SCRATCH_ROWS, width), self.dtype),
@@ -143,14 +146,14 @@ class SaraDictionary:
         self._workers.run(kernels.synthesise_finest, out, job)
         return out
 
-    def dual_step(self, model_bar, dual, threshold, weights=None, out=None):
+    def dual_step(self, model_bar, dual, threshold, weights=None, out=None, relaxation=1.0):
         """Update the dual variable of the prior in place and return Ψ dual, in one sweep over the bases.
 
         With u = dual + Ψ† model_bar,
 
-            dual ← clip(u, ± threshold·weights) = u − soft(u, threshold·weights),
+            dual ← dual + ρ(clip(u, ± threshold·weights) − dual),   clip(u, ± t) = u − soft(u, t),
 
-        the proximal operator of the conjugate of threshold·‖weights · ‖₁ (Moreau).
+        the proximal operator of the conjugate of threshold·‖weights · ‖₁ (Moreau), relaxed by ρ.
 
         Parameters
         ----------
@@ -164,6 +167,8 @@ class SaraDictionary:
             W ≥ 0; ones when None.
         out : (nx, ny), optional
             Receives Ψ dual.
+        relaxation : float
+            ρ.
 
         Raises
         ------
@@ -174,7 +179,7 @@ class SaraDictionary:
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
         if not np.min(threshold) >= 0:
             raise ValueError(f"threshold={threshold} must not be negative")
-        self._params[:] = np.reshape(threshold, (-1, 1, 1))
+        self._params[:, 0], self._params[:, 1] = threshold, relaxation
         if weights is None:
             job = self._job(dual, kernels.CLIP)
         else:
@@ -183,19 +188,18 @@ class SaraDictionary:
         self._workers.run(kernels.synthesise_finest, out, job)
         return out
 
-    def reweight(self, image, alpha, out):
-        """Fill `out`, an array of `coef_shape`, with the weights α/(α + |Ψ† image|).
+    def reweight(self, image, alpha, scale, out):
+        """Fill `out`, an array of `coef_shape`, with the weights s·α/(α + d̄), d̄ what is around in Ψ† image.
 
-        `alpha` > 0 is one number per band, in the order of `bands`, or one for all.
+        d̄ is the root mean square of a coefficient and its eight neighbours in the band (periodic).  `alpha` > 0 and
+        `scale` s are one number per band, in the order of `bands`, or one for all.
         """
-        out = self._checked(out, "out", self.coef_shape)
-        bands = self.bands()
-        alpha = np.broadcast_to(alpha, len(bands))
-        if not np.all(alpha > 0):
+        out = self.analysis(image, self._checked(out, "out", self.coef_shape))
+        params = np.empty((len(self._rectangles), 2), self.dtype)
+        params[:, 0], params[:, 1] = alpha, scale
+        if not np.all(params[:, 0] > 0):
             raise ValueError(f"alpha must be positive in every band, its minimum is {np.min(alpha)}")
-        for band, value in zip(bands, alpha):
-            self._params[band.basis, max(band.level, 1) - 1, ORIENTATIONS.index(band.orientation)] = value
-        self._analyse(image, self._job(out, kernels.REWEIGHT))
+        self._workers.run(neighbourhood_weights, out, self._rectangles, params, self._ring)
         return out
 
     def _checked(self, array, name, shape):
@@ -212,6 +216,12 @@ class SaraDictionary:
         image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
         self._workers.run(kernels.analyse_finest, image, job)
         self._workers.run(kernels.transform_deeper, job, True, back)
+
+
+def _rectangle(band):
+    """Basis, first row, end row, first column and end column of a band."""
+    basis, rows, columns = band.slice
+    return basis, rows.start, rows.stop, columns.start, columns.stop
 
 
 def _aligned(shape, dtype):

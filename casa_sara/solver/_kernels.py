@@ -7,13 +7,13 @@ _jit = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "arcp", "ns
 
 
 @_jit
-def residual_norm_sq(vis, phi_bar, phi_model, start, stop):
-    """Replace Φx_{t−2} by Φx_{t−1} = (Φx̄ + Φx_{t−2})/2 and return ‖y − Φx_{t−1}‖² of one block."""
+def residual_norm_sq(vis, phi_bar, phi_anchor, relaxation, start, stop):
+    """From Φx̄ and Φz, x̄ = 2x − z, return ‖y − Φx‖² of one block, and replace Φz by that of z + ρ(x − z)."""
     total = 0.0
     half = phi_bar.real.dtype.type(0.5)
     for m in range(start, stop):
-        predicted = half * (phi_bar[m] + phi_model[m])
-        phi_model[m] = predicted
+        predicted = half * (phi_bar[m] + phi_anchor[m])
+        phi_anchor[m] += relaxation * (predicted - phi_anchor[m])
         residual = vis[m] - predicted
         total += residual.real**2 + residual.imag**2
     return total
@@ -35,28 +35,35 @@ def shifted_norms(dual, phi_bar, vis, precond, multiplier, start, stop):
 
 
 @_jit
-def update_dual(dual, phi_bar, vis, precond, multiplier, start, stop):
-    """v ← U(s − z) = λ(v + U(Φx̄ − y))/(U + λ) for one block."""
+def update_dual(dual, phi_bar, vis, precond, multiplier, relaxation, start, stop):
+    """v ← v + ρ(ṽ − v), ṽ = U(s − z) = λ(v + U(Φx̄ − y))/(U + λ), for one block."""
     for m in range(start, stop):
         u = precond[m]
-        dual[m] = (multiplier / (u + multiplier)) * (dual[m] + u * (phi_bar[m] - vis[m]))
+        projected = (multiplier / (u + multiplier)) * (dual[m] + u * (phi_bar[m] - vis[m]))
+        dual[m] += relaxation * (projected - dual[m])
 
 
 @_jit
-def primal_step(model, model_bar, data_gradient, prior_gradient, tau, l2_step, positivity):
-    """x⁺ = P(x − τ(ηΦ†v + Ψu)) and x̄ = 2x⁺ − x; return ‖x⁺ − x‖² and ‖x⁺‖²."""
+def primal_step(model, anchor, model_bar, data_gradient, prior_gradient, steps, lowest):
+    """z ← z + ρ(x − z), x⁺ = max(z − τ(ηΦ†v + Ψu), lowest), x̄ = 2x⁺ − z; return ‖x⁺ − x‖² and ‖x⁺‖².
+
+    Steps are τ, η, ρ.
+    """
+    tau, l2_step, relaxation = steps
     change = 0.0
     norm = 0.0
-    flat, bar = model.reshape(-1), model_bar.reshape(-1)
-    g, p = data_gradient.reshape(-1), prior_gradient.reshape(-1)
+    flat, relaxed, bar = model.reshape(-1), anchor.reshape(-1), model_bar.reshape(-1)
+    g, p, low = data_gradient.reshape(-1), prior_gradient.reshape(-1), lowest.reshape(-1)
     for i in range(flat.size):
         old = flat[i]
-        new = old - tau * (l2_step * g[i] + p[i])
-        if positivity and new < 0:
-            new = type(new)(0)
+        start = relaxed[i] + relaxation * (old - relaxed[i])
+        new = start - tau * (l2_step * g[i] + p[i])
+        if new < low[i]:
+            new = low[i]
         difference = new - old
+        relaxed[i] = start
         flat[i] = new
-        bar[i] = new + difference
+        bar[i] = new + (new - start)
         change += difference * difference
         norm += new * new
     return change, norm

@@ -9,6 +9,8 @@ from casa_sara.solver.prox import ellipsoid_multiplier
 
 __all__ = ["AdaptivePPD"]
 
+RELAXATION = 1.8
+
 
 class AdaptivePPD:
     """The iteration that minimises ‖WΨ†x‖₁ over x ≥ 0 subject to the data.
@@ -24,6 +26,10 @@ class AdaptivePPD:
     19    σ = ‖x − x_prev‖ / ‖x‖
     ====  ==========================================================================
 
+    Steps 5, 13 and 17 are over-relaxed: v ← v + ρ(ṽ − v), u ← u + ρ(ũ − u) with ṽ, ũ what the table says, and the
+    image's step starts from z ← z + ρ(x − z), so that x̄ = 2x − z.  ρ = 1 is the table itself (z = x_prev); any
+    0 < ρ < 2 has the same fixed points and converges under the same condition on the steps (Condat 2013).
+
     The projection onto the ellipsoid of block j is z_j − y_j = U(s_j − y_j)/(U + λ_j).  Either its radius, the
     bound ε_j, is given and the multiplier λ_j follows from ‖z_j − y_j‖ = ε_j (:attr:`l2_bounds`), or the
     multiplier is given (:attr:`multipliers`) and the bound is the radius that belongs to it: see
@@ -34,7 +40,7 @@ class AdaptivePPD:
     measurement : object
         `forward(image, out)` → whitened visibilities (M,), `adjoint(vis, out)` → real image; `shape`.
     dictionary : object
-        `allocate()`, `dual_step(model_bar, dual, threshold, weights, out)` with ‖Ψ‖ = 1.
+        `allocate()`, `dual_step(model_bar, dual, threshold, weights, out, relaxation)` with ‖Ψ‖ = 1.
     vis : complex (M,)
         Whitened visibilities y, one block after the other.
     offsets : int (d + 1,)
@@ -45,11 +51,17 @@ class AdaptivePPD:
         ‖U^½Φ‖², or anything larger.
     positivity : bool
         x ≥ 0, or only real.
+    relaxation : float
+        ρ.
 
     Attributes
     ----------
     model, model_bar : real (nx, ny)
         x and x̄.
+    anchor : real (nx, ny)
+        z.
+    lowest : real (nx, ny)
+        Least value of each pixel: 0, or −∞ without positivity.
     l1_dual, l2_dual
         u and v.
     l1_weights
@@ -64,16 +76,18 @@ class AdaptivePPD:
         Jy/pixel in the unit of the model, for the record.
     """
 
-    def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True):
+    def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True,
+                 relaxation=RELAXATION):
         self.measurement, self.dictionary = measurement, dictionary
         self.vis, self.precond, self.offsets = vis, precond, np.asarray(offsets)
-        self.positivity = positivity
+        self.relaxation = relaxation
         self.tau, self.l2_step = 0.495, 1.0 / data_norm_sq
         dtype = vis.real.dtype
         self.model = np.zeros(measurement.shape, dtype)
-        self.model_bar = np.zeros_like(self.model)
+        self.anchor, self.model_bar = np.zeros_like(self.model), np.zeros_like(self.model)
+        self.lowest = np.full_like(self.model, 0 if positivity else -np.inf)
         self._data_gradient, self._prior_gradient = np.zeros_like(self.model), np.zeros_like(self.model)
-        self.l2_dual, self._phi_bar, self._phi_model = (np.zeros_like(vis) for _ in range(3))
+        self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
         self.l1_dual, self.l1_weights = dictionary.allocate(), None
         self.threshold = 0.0
         self.multipliers = np.zeros(self.n_blocks)
@@ -93,10 +107,11 @@ class AdaptivePPD:
         return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
     def start_from(self, model):
-        """Set x and x̄ to `model`; the dual variables stay."""
+        """Set x, z and x̄ to `model`; the dual variables stay."""
         self.model[...] = model
+        self.anchor[...] = model
         self.model_bar[...] = model
-        self.measurement.forward(self.model, self._phi_model)
+        self.measurement.forward(self.model, self._phi_anchor)
 
     def step(self):
         """Do one iteration."""
@@ -106,21 +121,24 @@ class AdaptivePPD:
             self._data_step(j, start, stop)
         self.measurement.adjoint(self.l2_dual, self._data_gradient)
         # Step 13: prior
-        self.dictionary.dual_step(self.model_bar, self.l1_dual, self.threshold, self.l1_weights, self._prior_gradient)
+        self.dictionary.dual_step(self.model_bar, self.l1_dual, self.threshold, self.l1_weights, self._prior_gradient,
+                                  self.relaxation)
         # Steps 17–19: image
         dtype = self.model.dtype.type
-        change, norm = kernels.primal_step(self.model, self.model_bar, self._data_gradient, self._prior_gradient,
-                                           dtype(self.tau), dtype(self.l2_step), self.positivity)
+        steps = dtype(self.tau), dtype(self.l2_step), dtype(self.relaxation)
+        change, norm = kernels.primal_step(self.model, self.anchor, self.model_bar, self._data_gradient,
+                                           self._prior_gradient, steps, self.lowest)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
         self.iteration += 1
 
     def _data_step(self, j, start, stop):
-        args = self.l2_dual, self._phi_bar, self.vis, self.precond
+        args, real = (self.l2_dual, self._phi_bar, self.vis, self.precond), self.precond.dtype.type
+        relaxation = real(self.relaxation)
         self.residual_norms[j] = np.sqrt(
-            kernels.residual_norm_sq(self.vis, self._phi_bar, self._phi_model, start, stop))
+            kernels.residual_norm_sq(self.vis, self._phi_bar, self._phi_anchor, relaxation, start, stop))
         if self.l2_bounds is not None:
             self.multipliers[j] = ellipsoid_multiplier(*args, self.l2_bounds[j], self.multipliers[j], start, stop)
-        kernels.update_dual(*args, self.precond.dtype.type(self.multipliers[j]), start, stop)
+        kernels.update_dual(*args, real(self.multipliers[j]), relaxation, start, stop)
 
     def rescale(self, threshold):
         """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.

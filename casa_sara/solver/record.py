@@ -38,7 +38,8 @@ class SolverRecord:
     bounds : list of (int, float (d,))
         Iteration and ε_j, at the start and whenever they moved.
     reweightings : list of dict
-        Iteration, scale of the weights and relative change of the model since the one before.
+        Iteration, scale of the weights, relative change of the model since the one before, and pixels that were then
+        allowed to be negative.
     stop_code : int
         One of the codes of this module.
     """
