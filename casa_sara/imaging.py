@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,12 +20,13 @@ from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
-from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sort_into_blocks
+from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
 __all__ = ["Result", "make_image"]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
+MOST_NAMED = 20  # wild samples that the log names one by one
 IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
 
 
@@ -66,17 +67,18 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise = noise_from_differences(data, offsets)
     _describe(data, blocks, noise)
-    weights = imaging_weights(data, grid, weighting)
-    operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
-    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
-    beam = fit_beam(psf, plane)
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
         density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
         reconstruction = _solve(data, offsets, density, grid, options, noise, start)
         model = reconstruction.model
+        data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
+    weights = imaging_weights(data, grid, weighting)
+    operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
+    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
+    beam = fit_beam(psf, plane)
     residual = dirty_image(operator, data.vis - operator.forward(model), weights)
     images = dict(psf=psf, residual=residual, model=model)
     write_products(output.imagename, plane, images, sum_of_weights(data, selection, weights), beam,
@@ -119,9 +121,29 @@ def _solve(data, offsets, density, grid, options, noise, start):
     record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
+    released = sum(update["released"] for update in record.reweightings)
+    if released:
+        log.info(f"{released} pixels beside unresolved sources were allowed to be negative: the sources are between pixels")
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: l2 bound {bound:.5g}, residual {norm:.5g} (whitened)")
     return reconstruction
+
+
+def _without_wild(data, blocks, offsets, reconstruction):
+    """Leave out what the reconstruction left out, and say what that was."""
+    wild = reconstruction.wild
+    if not wild:
+        return data, blocks
+    log.warn(f"{len(wild)} wild samples, which no sky explains, are left out:")
+    for one in wild[:MOST_NAMED]:
+        log.warn(f"  {one['ms']} row {one['row']}, spw {one['spw']}, channel {one['channel']}, antennas "
+                 f"{one['antenna1']} and {one['antenna2']}, {clock(one['time_mjd_s'])}: {one['amplitude_jy']:.4g} Jy where "
+                 f"the image has {one['predicted_jy']:.4g} Jy")
+    if len(wild) > MOST_NAMED:
+        log.warn(f"  … and {len(wild) - MOST_NAMED} more, in the record's 'wild'")
+    samples = np.diff(np.searchsorted(reconstruction.kept, offsets))
+    blocks = [replace(block, samples=int(count)) for block, count in zip(blocks, samples)]
+    return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks
 
 
 def _describe(data, blocks, noise):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["noise_from_differences"]
+__all__ = ["MEDIAN_TO_SIGMA", "noise_from_differences", "series_of_rows"]
 
 FEWEST_DIFFERENCES = 20
-_MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
+MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
 
 
 def noise_from_differences(visibilities, offsets):
@@ -35,11 +35,11 @@ def noise_from_differences(visibilities, offsets):
         Standard deviation of Re V·√w and of Im V·√w: 1 where the weights are right, 2 where the
         noise is twice what they say. NaN where fewer than 20 differences can be formed.
     """
-    series = _series_of_rows(visibilities.rows)
+    series = series_of_rows(visibilities.rows)
     return np.array([_block_noise(visibilities, slice(*ends), series) for ends in zip(offsets[:-1], offsets[1:])])
 
 
-def _series_of_rows(rows):
+def series_of_rows(rows):
     """Number the distinct (MeasurementSet, observation, field, spw, baseline) and return each row's."""
     key = np.zeros(rows.time.size, dtype=np.int64)
     for column in (rows.ms, rows.observation, rows.field, rows.spw, rows.antenna1, rows.antenna2):
@@ -70,4 +70,4 @@ def _block_noise(visibilities, block, series):
     else:
         return np.nan
     whitened = difference / np.sqrt(variance)
-    return float(_MEDIAN_TO_SIGMA * np.median(np.abs([whitened.real, whitened.imag])))
+    return float(MEDIAN_TO_SIGMA * np.median(np.abs([whitened.real, whitened.imag])))

@@ -9,6 +9,7 @@ import numpy as np
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.operators.norms import power_method
+from casa_sara.outliers import find_wild
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.nnls import nnls
@@ -17,8 +18,9 @@ from casa_sara.solver.reweighting import Schedule, solve
 
 __all__ = ["Reconstruction", "reconstruct", "schedule_of"]
 
-STEP_BALANCE = 0.1  # κ in units of the mean brightness Σx²/Σ|x| of the first model
+STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
+ROUNDS = 6  # of leaving out wild samples
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
 
@@ -41,6 +43,10 @@ class Reconstruction:
         Last κ, Jy/pixel.
     noise_jy_per_beam : float
         Noise of the naturally weighted dirty image for the noise levels found.
+    kept : int (M',)
+        Samples that were used, numbers into the data given.
+    wild : list of dict
+        The others, named: see :class:`casa_sara.outliers.WildSamples`.
     """
 
     model: np.ndarray
@@ -51,6 +57,8 @@ class Reconstruction:
     data_norm_sq: float
     threshold: float
     noise_jy_per_beam: float
+    kept: np.ndarray
+    wild: list[dict]
 
 
 def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=None,
@@ -81,24 +89,32 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     if options.databound == "fixed" and len(options.l2bound) not in (1, len(offsets) - 1):
         raise ValueError(f"l2bound = {list(options.l2bound)}: there are {len(offsets) - 1} blocks; give one noise level "
                          "for all of them, or one for each")
-    # whitened samples, and images in units of the noise of one sample: every number is near 1
+    # images in units of the noise of one sample: every number is near 1
     unit_jy = float(np.mean(data.weight, dtype=float) ** -0.5)
-    sqrt_weight = np.sqrt(data.weight)
-    vis = data.vis * sqrt_weight
-    sqrt_weight *= np.float32(unit_jy)
-    measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight,
-                                      nthreads=options.nthreads)
-    dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
-    precond = _preconditioner(density, options.precondition)
-    data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),
-                                grid.shape, dtype=np.float32)
+    kept, wild = np.arange(data.size), []
+    for _ in range(ROUNDS):
+        problem = _Problem.of(data, density, grid, options, unit_jy)
+        # positivity and a vanishing sparsity alone: where the bounds start, and the model too
+        first, residual = nnls(problem.measurement, problem.vis, problem.precond, problem.data_norm_sq,
+                               positivity=options.positivity)
+        found = find_wild(data, offsets, residual, unit_jy * float(np.abs(first).sum(dtype=float)))
+        if found.index.size == 0:
+            break
+        wild += found.named(data)
+        good = np.delete(np.arange(data.size), found.index)
+        offsets = np.searchsorted(good, offsets)
+        data, density, kept = data.take(good), density[good], kept[good]
+    if found.index.size:
+        problem = _Problem.of(data, density, grid, options, unit_jy)
+        residual = np.delete(residual, found.index)
 
-    ppd = AdaptivePPD(measurement, dictionary, vis, offsets, precond, data_norm_sq, options.positivity)
+    data_norm_sq = problem.data_norm_sq
+    dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
+    ppd = AdaptivePPD(problem.measurement, dictionary, problem.vis, offsets, problem.precond, data_norm_sq,
+                      options.positivity)
     ppd.unit_jy = unit_jy
     samples = np.diff(offsets)
     weight_sums = np.add.reduceat(data.weight.astype(float), offsets[:-1]) * unit_jy**2
-    # positivity and a vanishing sparsity alone: where the bounds start, and the model too
-    first, residual = nnls(measurement, vis, precond, data_norm_sq, positivity=options.positivity)
     nnls_norms = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
     bounds = _bounds(ppd, nnls_norms, samples, weight_sums, noise, options)
     noise_only = _is_noise_only(ppd, bounds, weight_sums)
@@ -113,7 +129,30 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     ppd.model *= np.float32(unit_jy)
     noise_jy_per_beam = unit_jy * float(np.sum(weight_sums * bounds.noise_weights) ** -0.5)
     return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms, nnls_norms, record,
-                          data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam)
+                          data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam, kept, wild)
+
+
+@dataclass
+class _Problem:
+    """Whitened samples y = √w·V, and the operators that belong to them."""
+
+    vis: np.ndarray
+    measurement: MeasurementOperator
+    precond: np.ndarray
+    data_norm_sq: float
+
+    @classmethod
+    def of(cls, data, density, grid, options, unit_jy):
+        """Whiten the data and build their operator for images in `unit_jy`."""
+        sqrt_weight = np.sqrt(data.weight)
+        vis = data.vis * sqrt_weight
+        sqrt_weight *= np.float32(unit_jy)
+        measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight,
+                                          nthreads=options.nthreads)
+        precond = _preconditioner(density, options.precondition)
+        data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),
+                                    grid.shape, dtype=np.float32)
+        return cls(vis, measurement, precond, data_norm_sq)
 
 
 def schedule_of(options):
@@ -136,11 +175,13 @@ def _bounds(ppd, nnls_norms, samples, weight_sums, noise, options):
         return GivenBounds(chi_square_bounds(samples), **common)
     if options.databound == "fixed":
         return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)), **common)
-    # never below the noise that the data show
-    floor = ppd.residual_norms / DYNAMIC_RANGE
+    # never below the noise that the data show, and from half-way between it and what NNLS leaves
+    floor, start = ppd.residual_norms / DYNAMIC_RANGE, nnls_norms
     if noise is not None:
-        floor = np.fmax(floor, np.asarray(noise) * np.sqrt(2.0 * samples))
-    return AdaptiveBounds(nnls_norms, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
+        measured = np.asarray(noise) * np.sqrt(2.0 * samples)
+        floor = np.fmax(floor, measured)
+        start = np.where(np.isfinite(measured), np.sqrt(nnls_norms * measured), nnls_norms)
+    return AdaptiveBounds(start, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
                           step=options.boundstep, min_interval=options.boundinterval)
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-__all__ = ["BlockInfo", "RowTable", "Visibilities", "snapshot_blocks", "sort_into_blocks"]
+__all__ = ["BlockInfo", "RowTable", "Visibilities", "clock", "snapshot_blocks", "sort_into_blocks"]
 
 SNAPSHOT_SECONDS = 1800.0
 SNAPSHOT_SAMPLES = 100_000
@@ -91,6 +91,11 @@ class Visibilities:
         """Number of samples M."""
         return self.vis.size
 
+    def take(self, index) -> Visibilities:
+        """Return the samples numbered `index`, in that order; `rows` stays whole."""
+        per_sample = ("vis", "weight", "imaging_weight", "uvw", "row", "chan")
+        return replace(self, **{name: np.take(getattr(self, name), index, axis=-1) for name in per_sample})
+
     @property
     def max_uv(self) -> float:
         """Longest projected baseline in wavelengths."""
@@ -116,12 +121,12 @@ class BlockInfo:
     @property
     def label(self) -> str:
         """The block in one line."""
-        first, last = (_clock(time) for time in (self.start, self.end))
+        first, last = (clock(time) for time in (self.start, self.end))
         observations, scans = (",".join(map(str, numbers)) for numbers in (self.observations, self.scans))
         return f"{self.ms_name} observation {observations} scan {scans}, {first} to {last}, {self.samples} samples"
 
 
-def _clock(mjd_seconds):
+def clock(mjd_seconds):
     """Spell a time in UTC."""
     return str(np.datetime64("1858-11-17T00:00:00") + np.timedelta64(round(mjd_seconds), "s"))
 
@@ -292,7 +297,5 @@ def sort_into_blocks(visibilities, block_of_sample):
         Block j is the slice offsets[j]:offsets[j + 1].
     """
     order = np.argsort(block_of_sample, kind="stable")
-    per_sample = ("vis", "weight", "imaging_weight", "uvw", "row", "chan")
-    columns = {name: np.take(getattr(visibilities, name), order, axis=-1) for name in per_sample}
     offsets = np.concatenate([[0], np.cumsum(np.bincount(block_of_sample))]).astype(np.int64)
-    return replace(visibilities, **columns), offsets
+    return visibilities.take(order), offsets

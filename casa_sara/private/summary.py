@@ -12,7 +12,7 @@ from casa_sara.solver.record import ITERATION_LIMIT, STOP_DESCRIPTIONS
 __all__ = ["summary"]
 
 WHY = {
-    "threshold_jy_per_pixel": "kappa of the last iteration: starts at 0.1 of the mean brightness of the NNLS image, "
+    "threshold_jy_per_pixel": "kappa of the last iteration: starts at 0.15 of the mean brightness of the NNLS image, "
     "shrinks with every re-weighting, is halved where the residual rises; sets the pace only",
     "noise_jy_per_beam": "of the naturally weighted dirty image, from the weights and the noise levels found",
     "data_norm_sq": "largest eigenvalue of the preconditioned normal operator, by Lanczos iterations",
@@ -73,6 +73,7 @@ def _sara(result, options, full):
             "regscale": options.regscale,
         }
         sara["why"] = dict(WHY)
+        sara["wild"] = [dict(sample) for sample in solved.wild]
         sara["reweightings"] = [dict(update) for update in record.reweightings]
         sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds} for iteration, bounds in record.bounds]
         if full:

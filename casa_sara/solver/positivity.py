@@ -10,44 +10,58 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import binary_dilation, maximum_filter
 
-__all__ = ["release_beside_sources"]
+__all__ = ["Release"]
 
 SIGNIFICANT = 5.0  # standard deviations of the noise
 LOBE = 0.25  # deepest negative lobe of a shifted sinc: 0.217 of its peak
 REACH = 3  # pixels around
 
 
-def release_beside_sources(ppd, bounds):
-    """Lower the bounds of pixels that the data want to be negative, as far as a source nearby explains it.
+class Release:
+    """Lowers the bounds of pixels that the data want to be negative, as far as a source nearby explains it.
 
     The gradient of the data, weighted by density as the steps are so that it is local,
 
         g = Φ†UΣ⁻¹(y − Φx) / √(Σ_m U_m² w_m/σ_m²),
 
-    is noise of unit variance where the model is right.  Where g < −5, and up to 3 pixels around, the lower bound becomes
-    −0.25 × the brightest pixel within 3 pixels.  What was released once stays so.
-
-    Parameters
-    ----------
-    ppd : AdaptivePPD
-        `lowest` is changed in place.
-    bounds : GivenBounds or AdaptiveBounds
-
-    Returns
-    -------
-    int
-        Number of pixels with a negative lower bound that were not released before.
+    is noise of unit variance where the model is right.  A pixel at its lower bound asks to be released where g < −5.  Where
+    it asks in two calls one after the other (a model that still moves swings to either side), and up to 3 pixels around,
+    the lower bound becomes −0.25 × the brightest pixel within 3 pixels.  What was released once stays so.
     """
+
+    def __init__(self):
+        self._wanted_before = False
+
+    def update(self, ppd, bounds):
+        """Release what the residual of the present model asks for.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            `lowest` is changed in place.
+        bounds : GivenBounds or AdaptiveBounds
+
+        Returns
+        -------
+        int
+            Number of pixels with a negative lower bound that had none before.
+        """
+        wanted = _wanted(ppd, bounds)
+        both, self._wanted_before = wanted & self._wanted_before, wanted
+        if not both.any():
+            return 0
+        around = binary_dilation(both, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
+        before = np.count_nonzero(ppd.lowest)
+        lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
+        np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around)
+        return int(np.count_nonzero(ppd.lowest)) - before
+
+
+def _wanted(ppd, bounds):
+    """Which pixels ask to be released; bool (nx, ny)."""
     weights = ppd.precond * np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(ppd.precond.dtype)
-    centre = np.zeros_like(ppd.model)
-    centre[0, 0] = 1
-    noise_sq = ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(centre))[0, 0]
+    pixel = np.zeros_like(ppd.model)
+    pixel[0, 0] = 1
+    noise_sq = ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(pixel))[0, 0]
     gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)))
-    wanted = gradient < -SIGNIFICANT * np.sqrt(noise_sq)
-    if not wanted.any():
-        return 0
-    wanted = binary_dilation(wanted, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
-    before = np.count_nonzero(ppd.lowest)
-    lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1) * wanted
-    np.minimum(ppd.lowest, -lobes, out=ppd.lowest)
-    return np.count_nonzero(ppd.lowest) - before
+    return (gradient < -SIGNIFICANT * np.sqrt(noise_sq)) & (ppd.model <= ppd.lowest)

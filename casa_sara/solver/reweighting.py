@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casa_sara.solver.positivity import release_beside_sources
+from casa_sara.solver.positivity import Release
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE, SolverRecord
 
 __all__ = ["Schedule", "band_noise", "solve"]
@@ -15,7 +15,7 @@ SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at t
 RISE = 1.05  # of the residual norm within one interval, from its least
 STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
-RELEASE_SCALE = 2.5  # α from which on the residual tells noise from what positive pixels cannot hold
+RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
@@ -95,10 +95,10 @@ def _rms(values):
 def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False):
     """Algorithm 2: solve, re-weight, and solve again until nothing changes.
 
-    The weights start at W = ν, the square root of the noise of each band relative to that of a pixel (at least 1);
-    those of re-weighting k are W = ν α/(α + d̄) with d̄ the root mean square of a coefficient of Ψ†x and its eight
-    neighbours, and α = max(10 ω^{k−1}, 1.5) × the noise of the band.  The paper has 1, ω^k × the largest coefficient
-    of the basis, and d̄ = |Ψ†x|: docs/decisions.md, "Weights from the noise".
+    The weights start at W = ν, the noise of each band relative to that of a pixel (at least 1); those of re-weighting k
+    are W = ν α/(α + d̄) with d̄ the root mean square of a coefficient of Ψ†x and its eight neighbours, and
+    α = max(10 ω^{k−1}, 1.5) × the noise of the band or of a pixel, whichever is less.  The paper has 1, ω^k × the
+    largest coefficient of the basis, and d̄ = |Ψ†x|: docs/decisions.md, "Weights from the noise".
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
     bounds.apply_to(ppd)
     _first_weights(ppd, bounds, weight_sums)
     record.bounds.append((0, bounds.l2_bounds.copy()))
-    previous = ppd.model.copy()
+    previous, release = ppd.model.copy(), Release()
 
     def solve_one(k, last):
         return _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped)
@@ -132,7 +132,7 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
             break
         change = _relative(ppd.model, previous)
         scale = FIRST_SCALE * schedule.reweight_decay**k
-        released = release_beside_sources(ppd, bounds) if scale <= RELEASE_SCALE else 0
+        released = release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
         if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:
             break
         previous[...] = ppd.model
@@ -178,7 +178,7 @@ def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
 
 
 def _first_weights(ppd, bounds, weight_sums):
-    """W = ν: the square root of the noise of every band in units of a pixel's, but at least 1.
+    """W = ν: the noise of every band in units of a pixel's, but at least 1.
 
     Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
     threshold at the noise of one pixel would let it through.
@@ -192,13 +192,13 @@ def _first_weights(ppd, bounds, weight_sums):
 
 def _band_scales(noise, pixel):
     """ν of every band."""
-    return np.sqrt(np.maximum(noise / pixel, 1.0))
+    return np.maximum(noise / pixel, 1.0)
 
 
 def _reweight(ppd, bounds, weight_sums, scale):
-    """W = ν α/(α + d̄), α = scale × the noise of the band."""
+    """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less."""
     noise, pixel = band_noise(ppd, bounds.noise_weights, weight_sums)
-    ppd.dictionary.reweight(ppd.model, scale * noise, _band_scales(noise, pixel), ppd.l1_weights)
+    ppd.dictionary.reweight(ppd.model, scale * np.minimum(noise, pixel), _band_scales(noise, pixel), ppd.l1_weights)
     ppd.rescale(SHRINK * ppd.threshold)
     bounds.apply_to(ppd)
 
