@@ -113,21 +113,20 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     ppd = AdaptivePPD(problem.measurement, dictionary, problem.vis, offsets, problem.precond, data_norm_sq,
                       options.positivity)
     ppd.unit_jy = unit_jy
-    samples = np.diff(offsets)
-    weight_sums = np.add.reduceat(data.weight.astype(float), offsets[:-1]) * unit_jy**2
+    weights = data.weight * np.float32(unit_jy**2)
     nnls_norms = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
-    bounds = _bounds(ppd, nnls_norms, samples, weight_sums, noise, options)
-    noise_only = _is_noise_only(ppd, bounds, weight_sums)
+    bounds = _bounds(ppd, nnls_norms, weights, noise, options)
+    noise_only = _is_noise_only(ppd, bounds)
     if startmodel is not None:
         first = startmodel / np.float32(unit_jy)
     ppd.start_from(first)
     ppd.rescale(STEP_BALANCE * _mean_brightness(first))
 
-    record = solve(ppd, bounds, weight_sums, schedule_of(options), progress, stopped)
+    record = solve(ppd, bounds, schedule_of(options), progress, stopped)
     if record.stop_code == CONVERGED and noise_only:
         record.stop_code = NOISE_ONLY
     ppd.model *= np.float32(unit_jy)
-    noise_jy_per_beam = unit_jy * float(np.sum(weight_sums * bounds.noise_weights) ** -0.5)
+    noise_jy_per_beam = unit_jy * bounds.total_weight**-0.5
     return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms, nnls_norms, record,
                           data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam, kept, wild)
 
@@ -169,27 +168,29 @@ def _preconditioner(density, wanted):
     return (precond / precond.max()).astype(np.float32)
 
 
-def _bounds(ppd, nnls_norms, samples, weight_sums, noise, options):
+def _bounds(ppd, nnls_norms, weights, noise, options):
+    samples = np.diff(ppd.offsets)
+    weight_sums = np.add.reduceat(weights, ppd.offsets[:-1], dtype=float)
     common = dict(samples=samples, weight_sums=weight_sums, n_bases=ppd.dictionary.n_bases, regscale=options.regscale)
     if options.databound == "weights":
         return GivenBounds(chi_square_bounds(samples), **common)
     if options.databound == "fixed":
         return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)), **common)
     # never below the noise that the data show, and from half-way between it and what NNLS leaves
-    floor, start = ppd.residual_norms / DYNAMIC_RANGE, nnls_norms
+    floor, start, thermal = ppd.residual_norms / DYNAMIC_RANGE, nnls_norms, np.inf
     if noise is not None:
         measured = np.asarray(noise) * np.sqrt(2.0 * samples)
-        floor = np.fmax(floor, measured)
+        floor, thermal = np.fmax(floor, measured), np.where(np.isfinite(measured), measured, np.inf)
         start = np.where(np.isfinite(measured), np.sqrt(nnls_norms * measured), nnls_norms)
-    return AdaptiveBounds(start, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
+    return AdaptiveBounds(start, **common, floor=floor, thermal=thermal, sample_weights=weights, rel_change=options.boundrelchange, tol=options.boundtol,
                           step=options.boundstep, min_interval=options.boundinterval)
 
 
-def _is_noise_only(ppd, bounds, weight_sums):
+def _is_noise_only(ppd, bounds):
     """Whether the naturally weighted dirty image holds no peak above 5 times its noise."""
     whitening = np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(np.float32)
     dirty = ppd.measurement.adjoint(ppd.vis * whitening)
-    return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(np.sum(weight_sums * bounds.noise_weights)))
+    return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(bounds.total_weight))
 
 
 def _mean_brightness(model):

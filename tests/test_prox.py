@@ -73,7 +73,7 @@ def test_the_dual_update_is_moreaus_complement_of_the_projection():
     shifted = dual / precond + point
     expected = precond * (shifted - project_ellipsoid(shifted, centre, precond, 2.0))
     multiplier = ellipsoid_multiplier(dual, point, centre, precond, 2.0)
-    kernels.update_dual(dual, point, centre, precond, multiplier, 1.0, 0, 80)
+    kernels.update_dual(dual, point, centre, precond, np.ones(80), multiplier, 1.0, 0, 80)
     np.testing.assert_allclose(dual, expected, rtol=1e-8)
 
 

@@ -170,8 +170,35 @@ def test_noise_levels_are_found_from_any_start(start):
     power = np.abs(problem.measurement.matrix[:, 0]) ** 2
     sums = np.add.reduceat(power, problem.offsets[:-1])
     bounds = AdaptiveBounds(start * np.sqrt(2.0 * samples), samples, sums, 3)
-    solve(_ppd(problem), bounds, sums, Schedule(nreweights=8))
+    solve(_ppd(problem), bounds, Schedule(nreweights=8))
     np.testing.assert_allclose(bounds.noise, noise, rtol=0.1)
+
+
+def test_errors_are_shared_by_amplitude_above_the_thermal_noise():
+    """Gain errors of a known size: s_m² is that of noise and gain errors of every sample, and the weights follow."""
+    thermal, gain = 2.0, 0.05
+    problem = Problem(seed=16, samples=(400, 500))
+    ppd = _ppd(problem)
+    ppd.model[...] = 40 * problem.truth
+    power = np.abs(problem.measurement.forward(ppd.model)) ** 2
+    s_sq = thermal**2 + gain**2 * power / 2
+    norms = np.sqrt(np.add.reduceat(2 * s_sq, problem.offsets[:-1]))
+    samples, weights = np.diff(problem.offsets), np.full(900, 0.1)
+    bounds = AdaptiveBounds(norms, samples, np.add.reduceat(weights, problem.offsets[:-1]), 3,
+                            thermal=thermal * np.sqrt(2.0 * samples), sample_weights=weights)
+    bounds.share(ppd)
+    variance = np.repeat(bounds.noise**2, samples) / ppd.spread
+    np.testing.assert_allclose(variance, s_sq, rtol=1e-10)
+    assert bounds.total_weight == pytest.approx(np.sum(weights / s_sq))
+    excess = 1 - np.sum(2 * samples * thermal**2) / np.sum(norms**2)
+    assert excess > 0.2
+    assert bounds.gradient_noise == pytest.approx((1 + 0.4 * excess) * np.sqrt(bounds.total_weight / 3))
+    # nothing above the thermal noise, or nothing known of it: all samples alike
+    for level in (norms / np.sqrt(2.0 * samples), np.inf):
+        bounds = AdaptiveBounds(norms, samples, np.ones(2), 3, thermal=level * np.sqrt(2.0 * samples), sample_weights=weights)
+        bounds.share(ppd)
+        np.testing.assert_allclose(ppd.spread, 1)
+        assert bounds.gradient_noise == pytest.approx(np.sqrt(bounds.total_weight / 3))
 
 
 def test_chi_square_bounds_hold_the_noise_of_unit_weights():
@@ -206,7 +233,7 @@ def test_reweighting_sharpens_and_every_update_is_recorded():
     def solution(nreweights):
         bounds = AdaptiveBounds(problem.errors, samples, sums, 3)
         ppd = _ppd(problem)
-        record = solve(ppd, bounds, sums, Schedule(nreweights=nreweights, reweight_tol=1e-4))
+        record = solve(ppd, bounds, Schedule(nreweights=nreweights, reweight_tol=1e-4))
         return ppd.model, record
 
     plain, record = solution(0)
@@ -223,14 +250,14 @@ def test_bounds_that_no_image_meets_are_recognised():
     problem = Problem(seed=14, samples=(20, 30), noise=(1.0, 1.0))
     ppd = _ppd(problem)
     bounds = GivenBounds(0.01 * problem.errors, np.diff(problem.offsets), np.ones(2), 3)
-    assert solve(ppd, bounds, np.ones(2), Schedule(nreweights=2)).stop_code == UNFEASIBLE
+    assert solve(ppd, bounds, Schedule(nreweights=2)).stop_code == UNFEASIBLE
 
 
 def test_given_bounds_are_met_at_the_end():
     problem = Problem(seed=15, samples=(20, 30), noise=(0.5, 0.5))
     ppd = _ppd(problem)
     bounds = GivenBounds(1.02 * problem.errors, np.diff(problem.offsets), np.ones(2), 3)
-    assert solve(ppd, bounds, np.ones(2), Schedule(nreweights=2)).stop_code == CONVERGED
+    assert solve(ppd, bounds, Schedule(nreweights=2)).stop_code == CONVERGED
     residual = problem.vis - problem.measurement.forward(ppd.model)
     norms = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
     assert np.all(norms <= 1.01 * bounds.l2_bounds)
@@ -238,9 +265,8 @@ def test_given_bounds_are_met_at_the_end():
 
 def test_iteration_limit_and_stop_request():
     problem = Problem(seed=13)
-    sums = np.ones(2)
-    record = solve(_ppd(problem), _given(problem, problem.errors), sums, Schedule(niter=7))
+    record = solve(_ppd(problem), _given(problem, problem.errors), Schedule(niter=7))
     assert (record.stop_code, record.iteration[-1]) == (ITERATION_LIMIT, 7)
     ppd = _ppd(problem)
-    record = solve(ppd, _given(problem, problem.errors), sums, stopped=lambda: ppd.iteration == 4)
+    record = solve(ppd, _given(problem, problem.errors), stopped=lambda: ppd.iteration == 4)
     assert (record.stop_code, record.iteration[-1]) == (STOPPED_BY_USER, 4)

@@ -35,11 +35,12 @@ def shifted_norms(dual, phi_bar, vis, precond, multiplier, start, stop):
 
 
 @_jit
-def update_dual(dual, phi_bar, vis, precond, multiplier, relaxation, start, stop):
-    """v ← v + ρ(ṽ − v), ṽ = U(s − z) = λ(v + U(Φx̄ − y))/(U + λ), for one block."""
+def update_dual(dual, phi_bar, vis, precond, spread, multiplier, relaxation, start, stop):
+    """v ← v + ρ(ṽ − v), ṽ = U(s − z) = λ(v + U(Φx̄ − y))/(U + λ), for one block; λ is multiplier × spread."""
     for m in range(start, stop):
         u = precond[m]
-        projected = (multiplier / (u + multiplier)) * (dual[m] + u * (phi_bar[m] - vis[m]))
+        share = multiplier * spread[m]
+        projected = (share / (u + share)) * (dual[m] + u * (phi_bar[m] - vis[m]))
         dual[m] += relaxation * (projected - dual[m])
 
 

@@ -68,6 +68,8 @@ class AdaptivePPD:
         W, or None for ones.
     threshold : float
         κ, in the unit of the model: only the speed depends on it, but see :meth:`rescale`.
+    spread : real (M,)
+        λ_j of each sample relative to its block's, where multipliers are given: ones unless set.
     residual_norms : float (d,)
         μ_j of the model before the last step.
     rel_change : float
@@ -88,6 +90,7 @@ class AdaptivePPD:
         self.lowest = np.full_like(self.model, 0 if positivity else -np.inf)
         self._data_gradient, self._prior_gradient = np.zeros_like(self.model), np.zeros_like(self.model)
         self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
+        self.spread = np.ones_like(precond)
         self.l1_dual, self.l1_weights = dictionary.allocate(), None
         self.threshold = 0.0
         self.multipliers = np.zeros(self.n_blocks)
@@ -138,7 +141,7 @@ class AdaptivePPD:
             kernels.residual_norm_sq(self.vis, self._phi_bar, self._phi_anchor, relaxation, start, stop))
         if self.l2_bounds is not None:
             self.multipliers[j] = ellipsoid_multiplier(*args, self.l2_bounds[j], self.multipliers[j], start, stop)
-        kernels.update_dual(*args, real(self.multipliers[j]), relaxation, start, stop)
+        kernels.update_dual(*args, self.spread, real(self.multipliers[j]), relaxation, start, stop)
 
     def rescale(self, threshold):
         """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.

@@ -8,6 +8,8 @@ import numpy as np
 
 __all__ = ["AdaptiveBounds", "GivenBounds", "chi_square_bounds"]
 
+ARTEFACTS = 0.4  # how much harder the prior is where all error is calibration error
+
 
 def chi_square_bounds(samples, noise=1.0):
     """Bounds ε_j that hold the noise of each block with a margin of two standard deviations.
@@ -73,9 +75,14 @@ class _NoiseLevels:
         return self.noise**-2.0
 
     @property
+    def total_weight(self):
+        """Σ_j σ_j⁻² Σ w: the peak of the point spread function of the weighted data."""
+        return float(np.sum(self.weight_sums * self.noise_weights))
+
+    @property
     def gradient_noise(self):
         """κ_g."""
-        return self.regscale * np.sqrt(np.sum(self.weight_sums * self.noise_weights) / self.n_bases)
+        return self.regscale * np.sqrt(self.total_weight / self.n_bases)
 
     def apply_to(self, ppd):
         """Hand the multipliers to the iteration, for its current κ."""
@@ -90,6 +97,9 @@ class GivenBounds(_NoiseLevels):
     def finish(self, ppd):
         """Make the bounds hard constraints, from where the multipliers have led."""
         ppd.l2_bounds = self.l2_bounds
+
+    def share(self, ppd):
+        """The errors are as given: nothing to share among the samples."""
 
     def adapt(self, ppd):
         """Nothing adapts; return False."""
@@ -106,29 +116,59 @@ class AdaptiveBounds(_NoiseLevels):
 
     A bound moves as in the paper: when the model has settled (σ < γ1), at least P iterations after its last
     move, and when the residual differs by more than γ2, by the fraction γ3 of the way to the residual norm μ_j.
-    It never falls below `floor`, the noise measured from the data themselves.
+    It never falls below `floor`.
 
     Parameters
     ----------
     floor : float (d,)
         Lowest bounds allowed.
+    thermal : float (d,)
+        Norms of the thermal noise, measured from the data themselves; inf where unknown.
+    sample_weights : float (M,), optional
+        w, in the units of the model.  Without them :meth:`share` does nothing.
     rel_change, tol, step, min_interval
         γ1, γ2, γ3, P.
     """
 
     floor: np.ndarray | float = 0.0
+    thermal: np.ndarray | float = np.inf
+    sample_weights: np.ndarray | None = None
     rel_change: float = 1e-2
     tol: float = 1e-2
     step: float = 0.618
     min_interval: int = 20
     _last_move: np.ndarray = field(init=False)
+    _artefacts: float = field(init=False, default=0.0)
 
     def __post_init__(self):
         self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
         self._last_move = np.zeros(len(self.l2_bounds), int)
 
+    @property
+    def gradient_noise(self):
+        """κ_g, up to 1.4 times as much where calibration errors, whose artefacts look like sources, prevail."""
+        return (1 + ARTEFACTS * self._artefacts) * super().gradient_noise
+
     def finish(self, ppd):
         """Nothing changes for the last problem."""
+
+    def share(self, ppd):
+        """Share the error of each block among its samples, by the amplitudes of the present model.
+
+        Thermal noise is the same in every whitened sample; what exceeds it, calibration errors, goes with the amplitude:
+
+            s_m² = (ε_th² + (ε_j² − ε_th²)·|Φx|_m²/⟨|Φx|²⟩_j) / (2M_j),   σ_j²/s_m² → `ppd.spread`.
+        """
+        if self.sample_weights is None:
+            return
+        model_vis = ppd.measurement.forward(ppd.model)
+        thermal = np.minimum(self.thermal, self.l2_bounds) ** 2
+        share = thermal / self.l2_bounds**2
+        for j, (start, stop) in enumerate(ppd.blocks()):
+            power = np.abs(model_vis[start:stop]) ** 2
+            ppd.spread[start:stop] = 1 / (share[j] + (1 - share[j]) * power / max(power.mean(), np.finfo(float).tiny))
+        self.weight_sums = np.add.reduceat(self.sample_weights * ppd.spread, ppd.offsets[:-1], dtype=float)
+        self._artefacts = 1 - float(np.sum(thermal) / np.sum(self.l2_bounds**2))
 
     def adapt(self, ppd):
         """Steps 7–10; return whether any bound moved."""

@@ -59,7 +59,8 @@ class Release:
 
 def _wanted(ppd, bounds):
     """Which pixels ask to be released; bool (nx, ny)."""
-    weights = ppd.precond * np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(ppd.precond.dtype)
+    weights = ppd.precond * ppd.spread
+    weights *= np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(weights.dtype)
     pixel = np.zeros_like(ppd.model)
     pixel[0, 0] = 1
     noise_sq = ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(pixel))[0, 0]

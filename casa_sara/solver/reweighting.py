@@ -55,20 +55,17 @@ class Schedule:
         return min(self.niter, (self.nreweights + 4) * self.interval)
 
 
-def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
+def band_noise(ppd, bounds, seed=20180404):
     """Standard deviation of the noise in every band of the dictionary, and of a pixel, in the unit of the model.
 
-    One realisation of the noise, weighted by 1/σ_j² as the data are, is carried to the image and normalised by
+    One realisation of the noise, weighted by 1/s_m² as the data are, is carried to the image and normalised by
     the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
     scratch space.
 
     Parameters
     ----------
     ppd : AdaptivePPD
-    noise_weights : float (d,)
-        1/σ_j².
-    weight_sums : float (d,)
-        Σ w of each block, in the unit of the model.
+    bounds : GivenBounds or AdaptiveBounds
 
     Returns
     -------
@@ -80,9 +77,10 @@ def band_noise(ppd, noise_weights, weight_sums, seed=20180404):
     rng = np.random.default_rng(seed)
     noise = np.empty_like(ppd.vis)
     for j, (a, b) in enumerate(ppd.blocks()):
-        noise[a:b] = np.sqrt(noise_weights[j]) * (rng.standard_normal(b - a) + 1j * rng.standard_normal(b - a))
+        noise[a:b] = rng.standard_normal(b - a) + 1j * rng.standard_normal(b - a)
+        noise[a:b] *= np.sqrt(bounds.noise_weights[j] * ppd.spread[a:b])
     image = ppd.measurement.adjoint(noise)
-    image /= image.dtype.type(np.sum(weight_sums * noise_weights))
+    image /= image.dtype.type(bounds.total_weight)
     coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
     bands = [_rms(coefs[band.slice]) for band in ppd.dictionary.bands()]
     return np.maximum(bands, 1e-30), _rms(image) / np.sqrt(ppd.dictionary.n_bases)
@@ -92,7 +90,7 @@ def _rms(values):
     return float(np.sqrt(np.mean(np.square(values, dtype=float))))
 
 
-def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False):
+def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False):
     """Algorithm 2: solve, re-weight, and solve again until nothing changes.
 
     The weights start at W = ν, the noise of each band relative to that of a pixel (at least 1); those of re-weighting k
@@ -105,8 +103,6 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
     ppd : AdaptivePPD
         The iteration, with its first κ (`threshold`) set.
     bounds : GivenBounds or AdaptiveBounds
-    weight_sums : float (d,)
-        Σ w of each block, in the unit of the model.
     schedule : Schedule
     progress : callable
         Called after every iteration with (ppd, record).
@@ -119,7 +115,7 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
     """
     record = SolverRecord()
     bounds.apply_to(ppd)
-    _first_weights(ppd, bounds, weight_sums)
+    _first_weights(ppd, bounds)
     record.bounds.append((0, bounds.l2_bounds.copy()))
     previous, release = ppd.model.copy(), Release()
 
@@ -136,7 +132,9 @@ def solve(ppd, bounds, weight_sums, schedule=Schedule(), progress=lambda ppd, re
         if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:
             break
         previous[...] = ppd.model
-        _reweight(ppd, bounds, weight_sums, max(scale, LAST_SCALE))
+        if scale <= LAST_SCALE:
+            bounds.share(ppd)
+        _reweight(ppd, bounds, max(scale, LAST_SCALE))
         record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
                                         released=released))
     if record.stop_code in (0, CONVERGED):
@@ -177,7 +175,7 @@ def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
             return CONVERGED if bounds.met_by(ppd) else UNFEASIBLE
 
 
-def _first_weights(ppd, bounds, weight_sums):
+def _first_weights(ppd, bounds):
     """W = ν: the noise of every band in units of a pixel's, but at least 1.
 
     Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
@@ -185,7 +183,7 @@ def _first_weights(ppd, bounds, weight_sums):
     """
     if ppd.l1_weights is None:
         ppd.l1_weights = ppd.dictionary.allocate()
-    noise, pixel = band_noise(ppd, bounds.noise_weights, weight_sums)
+    noise, pixel = band_noise(ppd, bounds)
     for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel)):
         ppd.l1_weights[band.slice] = scale
 
@@ -195,9 +193,9 @@ def _band_scales(noise, pixel):
     return np.maximum(noise / pixel, 1.0)
 
 
-def _reweight(ppd, bounds, weight_sums, scale):
+def _reweight(ppd, bounds, scale):
     """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less."""
-    noise, pixel = band_noise(ppd, bounds.noise_weights, weight_sums)
+    noise, pixel = band_noise(ppd, bounds)
     ppd.dictionary.reweight(ppd.model, scale * np.minimum(noise, pixel), _band_scales(noise, pixel), ppd.l1_weights)
     ppd.rescale(SHRINK * ppd.threshold)
     bounds.apply_to(ppd)
