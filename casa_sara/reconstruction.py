@@ -177,13 +177,13 @@ def _bounds(ppd, nnls_norms, weights, noise, options):
     if options.databound == "fixed":
         return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)), **common)
     # never below the noise that the data show, and from half-way between it and what NNLS leaves
-    floor, start, thermal = ppd.residual_norms / DYNAMIC_RANGE, nnls_norms, np.inf
+    floor, start = ppd.residual_norms / DYNAMIC_RANGE, nnls_norms
     if noise is not None:
         measured = np.asarray(noise) * np.sqrt(2.0 * samples)
-        floor, thermal = np.fmax(floor, measured), np.where(np.isfinite(measured), measured, np.inf)
+        floor = np.fmax(floor, measured)
         start = np.where(np.isfinite(measured), np.sqrt(nnls_norms * measured), nnls_norms)
-    return AdaptiveBounds(start, **common, floor=floor, thermal=thermal, sample_weights=weights, rel_change=options.boundrelchange, tol=options.boundtol,
-                          step=options.boundstep, min_interval=options.boundinterval)
+    return AdaptiveBounds(start, **common, floor=floor, sample_weights=weights, rel_change=options.boundrelchange,
+                          tol=options.boundtol, step=options.boundstep, min_interval=options.boundinterval)
 
 
 def _is_noise_only(ppd, bounds):

@@ -35,14 +35,15 @@ ROOMS = {
     "options": set(),
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
+    "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
     "casa": {"casa_sara", "casa_sara.options", "casa_sara.visibilities", "numpy", *CASA},
     "operators": {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },
-    "solver": {"casa_sara.options", "numpy", "numba"},
+    "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
     "analysis": {"numpy", "scipy", "astropy", "matplotlib"},
 }
-LIBRARY = ("options", "visibilities", "noise", "operators", "solver", "analysis")
+LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}

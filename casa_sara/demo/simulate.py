@@ -32,7 +32,7 @@ class Observation:
     hour_angles : (float, float)
         Range in hours over which the scans of all configurations are spread, interleaved.
     scans, integrations, integration_s :
-        Scans per configuration, integrations per scan and their length.
+        Scans per configuration (one number for all, or one for each), integrations per scan and their length.
     noise_scale, weight_scale : tuple of float
         For each configuration, a factor on its noise, and one on its WEIGHT that the noise does not
         follow (wrong weights); empty for ones.
@@ -50,7 +50,7 @@ class Observation:
     channels: int = 4
     correlations: str = "RR LL"
     hour_angles: tuple[float, float] = (-5.0, 5.0)
-    scans: int = 3
+    scans: int | tuple[int, ...] = 3
     integrations: int = 6
     integration_s: float = 10.0
     noise_scale: tuple[float, ...] = ()
@@ -142,8 +142,8 @@ def simulate_observation(
         vis = Path(out_dir) / f"{config}.ms"
         if vis.exists():
             raise FileExistsError(f"{vis} exists: simulate_observation does not overwrite")
-        start = (number + 0.5) / len(configs)
-        _lay_out(vis, config, (start + np.arange(observation.scans)) / observation.scans, observation)
+        start, scans = (number + 0.5) / len(configs), int(np.broadcast_to(observation.scans, len(configs))[number])
+        _lay_out(vis, config, (start + np.arange(scans)) / scans, observation)
         observed.append(_Rows(vis, sky, observation))
 
     noise_scale = observation.noise_scale or (1.0,) * len(configs)
