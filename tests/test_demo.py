@@ -154,6 +154,38 @@ def test_gain_errors_are_antenna_gains_of_each_scan(tmp_path, clean):
     assert all(block.noise == 0 and block.gain == block.error for block in simulation.blocks)
 
 
+def test_pointing_errors_are_gains_that_grow_from_the_centre(tmp_path):
+    """Two sources at half the way to the edge: opposite errors, antenna by antenna; one at the centre: none."""
+    rms, shape = 0.02, (48, 32)
+    observation = replace(SMALL, pointing_rms=rms)
+    ratios = {}
+    for name, place in (("centre", (24, 16)), ("east", (12, 16)), ("west", (36, 16)), ("north", (24, 24))):
+        image = np.zeros(shape)
+        image[place] = 1.0
+        (tmp_path / name).mkdir()
+        sky = Sky(image, 0.1 * ARCSEC)
+        simulation = simulate_observation(tmp_path / name, sky, "A", np.inf, 0.0, 3, observation)
+        data, uvw_m, first, second = columns(simulation.vis[0], "DATA", "UVW", "ANTENNA1", "ANTENNA2")
+        uvw = uvw_m * (observation.channel_freqs_hz[0] / C)
+        ratios[name] = data[0, 0] / predict(sky, uvw)
+        assert simulation.blocks[0].gain == simulation.blocks[0].error
+    np.testing.assert_allclose(ratios["centre"], 1, atol=1e-5)
+    assert np.abs(ratios["east"].imag).max() < 1e-5
+    np.testing.assert_allclose(ratios["east"].real - 1, 1 - ratios["west"].real, atol=1e-5)
+    assert np.std(ratios["east"].real) == pytest.approx(0.5 * np.sqrt(2) * rms, rel=0.3)
+    table_of = np.zeros((27, 27))
+    table_of[first[:351], second[:351]] = ratios["north"].real[:351] - 1
+    assert table_of[0, 1] + table_of[2, 3] == pytest.approx(table_of[0, 2] + table_of[1, 3], abs=1e-5)  # a sum of antennas
+    assert abs(table_of[0, 1] - table_of[0, 2]) > 1e-3
+    assert abs(np.corrcoef(ratios["east"].real, ratios["north"].real)[0, 1]) < 0.3  # the axes for themselves
+
+
+def test_scans_of_each_configuration(tmp_path):
+    simulation = simulate_observation(tmp_path, small_sky(), "AC", 30.0, 0.0, 0, replace(SMALL, scans=(3, 1)))
+    assert [np.unique(columns(vis, "SCAN_NUMBER")[0]).size for vis in simulation.vis] == [3, 1]
+    assert [block.scan for block in simulation.blocks] == [1, 2, 3, 1]
+
+
 def test_seed_decides(tmp_path):
     data = []
     for name, db, seed in (("a", 30.0, 1), ("b", 30.0, 1), ("c", 30.0, 2), ("d", 90.0, 1), ("e", 120.0, 1)):
