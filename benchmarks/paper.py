@@ -134,7 +134,7 @@ def band(name, base, truth):
     print(f"\n### {name} band: {sum(block.samples for block in simulation.blocks)} visibilities, {errors.size} blocks\n")
     print("| cell | pixels | tsara SNR at 0.1\" | flux | neighbour, Jy in 0.15\" (true) | bounds / true | MDR | s | iterations |")
     print("|---" * 9 + "|", flush=True)
-    models = {}
+    models, took = {}, {}
     for cell in cells:
         made, seconds = run(folder, vis, cell, f"tsara{cell}")
         model = read_image(folder / f"tsara{cell}.model")[0]
@@ -146,7 +146,7 @@ def band(name, base, truth):
         print(f"| {cell}\" | {model.shape[0]}×{model.shape[1]} | {snr(true, smoothed):.1f} | {model.sum() / truth.image.sum():.4f} | "
               f"{found:.5f} ({exact:.5f}) | {ratios.min():.2f}–{ratios.max():.2f} | {model.max() / max(outside, 1e-12):.3g} | "
               f"{seconds:.0f} | {made['iterdone']} |", flush=True)
-        models[cell] = model
+        models[cell], took[cell] = model, seconds
     low, high = (smooth(models[cell], 0.1 / cell) for cell in (cells[1], cells[2]))
     where = [(np.arange(n) - n // 2) * cells[2] / cells[1] + m // 2 for n, m in zip(high.shape, low.shape)]
     again = map_coordinates(low, np.meshgrid(*where, indexing="ij"), order=3) * (cells[2] / cells[1]) ** 2
@@ -155,7 +155,8 @@ def band(name, base, truth):
     cell = cells[COMPARED]
     os.rename(folder / f"tsara{cell}.model", folder / "tsara.model")
     images = {("tsara", w): residual_images(folder, vis, cell, "tsara", w) for w in WEIGHTING}
-    seconds = {w: run_clean(folder, vis, cell, w, images["tsara", w][2]) for w in WEIGHTING}
+    seconds = {f"clean_{w}": run_clean(folder, vis, cell, w, images["tsara", w][2]) for w in WEIGHTING}
+    seconds["tsara"] = took[cell]
     print(f"\n| model at {cell}\" | σ natural | σ Briggs | DR natural | DR Briggs | SNR at 0.1\" | neighbour, Jy | negative, Jy | s |")
     print("|---" * 9 + "|")
     found = {"tsara": models[cell]}
@@ -170,7 +171,7 @@ def band(name, base, truth):
         ranges = {w: dynamic_range(*images[key, w][:2]) for w in WEIGHTING}
         print(f"| {key} | {sigma['natural']:.3g} | {sigma['briggs']:.3g} | {ranges['natural']:.0f} | {ranges['briggs']:.0f} | "
               f"{snr(true, smooth(model, 0.1 / cell)):.1f} | {aperture(model, cell):.5f} | {np.minimum(model, 0).sum():.2f} | "
-              f"{seconds.get(key.removeprefix('clean_'), 0):.0f} |", flush=True)
+              f"{seconds[key]:.0f} |", flush=True)
     for w in WEIGHTING:
         beam = images["tsara", w][2]
         pair = [smooth(found[key], [axis / cell for axis in beam[:2]], beam[2]) for key in ("tsara", f"clean_{w}")]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ __all__ = ["Reconstruction", "reconstruct", "schedule_of"]
 
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
+NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
 ROUNDS = 6  # of leaving out wild samples
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
@@ -122,7 +123,10 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     ppd.start_from(first)
     ppd.rescale(STEP_BALANCE * _mean_brightness(first))
 
-    record = solve(ppd, bounds, schedule_of(options), progress, stopped)
+    schedule = schedule_of(options)
+    if noise_only:
+        schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
+    record = solve(ppd, bounds, schedule, progress, stopped)
     if record.stop_code == CONVERGED and noise_only:
         record.stop_code = NOISE_ONLY
     ppd.model *= np.float32(unit_jy)

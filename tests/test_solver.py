@@ -8,7 +8,7 @@ from scipy.optimize import minimize, nnls as scipy_nnls
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.nnls import nnls
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE
+from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE
 from casa_sara.solver.reweighting import Schedule, solve
 
 
@@ -254,6 +254,16 @@ def test_bounds_that_no_image_meets_are_recognised():
     ppd = _ppd(problem)
     bounds = GivenBounds(0.01 * problem.errors, np.diff(problem.offsets), np.ones(2), 3)
     assert solve(ppd, bounds, Schedule(nreweights=2)).stop_code == UNFEASIBLE
+
+
+def test_divergence_is_recognised_and_the_last_good_image_kept():
+    problem = Problem(seed=14, samples=(20, 30), noise=(0.5, 0.5))
+    ppd = _ppd(problem)
+    ppd.start_from(problem.truth)
+    bounds = AdaptiveBounds(problem.errors, np.diff(problem.offsets), np.ones(2), 3)
+    ppd.l2_step *= 1e6  # far beyond what converges
+    assert solve(ppd, bounds, Schedule(nreweights=5, interval=5000)).stop_code == DIVERGED
+    np.testing.assert_array_equal(ppd.model, problem.truth)
 
 
 def test_given_bounds_are_met_at_the_end():

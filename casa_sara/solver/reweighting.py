@@ -18,6 +18,7 @@ FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
 RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
+USUAL = 9  # re-weightings that most data need
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
 
@@ -52,7 +53,7 @@ class Schedule:
     @property
     def expected_iterations(self) -> int:
         """A guess of how many iterations it takes, for the progress."""
-        return min(self.niter, (self.nreweights + 4) * self.interval)
+        return min(self.niter, (min(self.nreweights, USUAL) + 3) * self.interval)
 
 
 def band_noise(ppd, bounds, seed=20180404):

@@ -253,7 +253,10 @@ class _tsara:
         The coarsest wavelets are 2^wavelevels pixels apart.
 
     positivity : bool, default True
-        True for the brightness of the sky. False is for skies with negative parts, such as the
+        True for the brightness of the sky. Only beside an unresolved source that lies between pixels,
+        which positive pixels cannot hold, the model may become negative where the data ask for it (five
+        standard deviations, twice in a row), by at most a quarter of the source; the log says how many
+        pixels. A finer cell needs less of it. False is for skies with negative parts, such as the
         decrement of the Sunyaev-Zeldovich effect; the model is then less constrained.
 
     precondition : bool, default True
@@ -320,8 +323,9 @@ class _tsara:
 
     regscale : float, default 1.0
         The weight of the sparsity prior against the data: 1 is the noise of one coefficient of the
-        gradient of the data, from the noise levels found and the weights. Larger values give a
-        smoother image, smaller ones follow the noise.
+        gradient of the data, from the noise levels found and the weights (where calibration errors
+        prevail, up to 1.4 times that). Larger values give a smoother image and an emptier background,
+        e.g. 2 for faint emission in a wide field; smaller ones follow the noise.
 
     blocks : int, default 0
         0 makes one block of each MeasurementSet, observation and scan, and splits long scans in
