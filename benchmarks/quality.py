@@ -4,6 +4,7 @@
     python benchmarks/quality.py FOLDER --only clean   # simulate and run tclean
     python benchmarks/quality.py FOLDER --only tsara   # run tsara on what was simulated, anew
     python benchmarks/quality.py FOLDER --only table   # the tables of docs/validation.md
+    python benchmarks/quality.py FOLDER --only longer  # what ten times the iterations would change
 
 tclean multiscale runs with Briggs −1 and natural weights. On the first case of every scene and array each of the
 settings in GRID is tried; the best against the truth, at half the beam, serves all cases of that scene and array
@@ -195,6 +196,23 @@ def run_tsara(case: Case, folder: Path, against: dict[str, dict], suffix="", **o
     return result
 
 
+def compare_with_longer(cases: list[Case], base: Path) -> None:
+    """Print SNRs with defaults and with ten times the interval and the iterations, at half of Briggs' beam and at one."""
+    from unittest import mock
+
+    from casa_sara.solver.reweighting import Schedule
+
+    patient = Schedule(niter=3400, interval=300, nreweights=11, reltol=1e-7, final_reltol=1e-7)
+    print("| case | at half beam | ten times longer | at one beam | ten times longer |\n" + "|---" * 5 + "|")
+    for case in cases:
+        folder, found = base / case.folder, cleaned(case, base)
+        usual = json.loads((folder / "tsara.json").read_text())["at"]["briggs"]
+        with mock.patch("casa_sara.reconstruction.schedule_of", lambda options: patient):
+            longer = run_tsara(case, folder, found, "_longer")["at"]["briggs"]
+        print(f"| {case.label} | " + " | ".join(f"{of[beam]:.1f}" for beam in ("0.5", "1.0") for of in (usual, longer)) + " |",
+              flush=True)
+
+
 def row(case: Case, base: Path):
     """Return a line of the table, and the margins over the harder CLEAN at half and one beam."""
     folder = base / case.folder
@@ -238,14 +256,16 @@ def print_table(base: Path, grid: list[Case]) -> None:
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", choices=("clean", "tsara", "table"))
+    parser.add_argument("--only", choices=("clean", "tsara", "table", "longer"))
     parser.add_argument("--cases", default="", help="only cases whose label holds this")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     base = options.folder.resolve()
     grid = [case for case in cases() if options.cases in case.label]
+    if options.only == "longer":
+        compare_with_longer([case for case in grid if case == Case(case.scene) or case.gain_rms == 0.03], base)
     for case in grid:
-        if options.only == "table":
+        if options.only in ("table", "longer"):
             break
         found = cleaned(case, base)
         if case == Case(case.scene) and options.only != "tsara":
