@@ -1,0 +1,83 @@
+"""What a comparison of images holds: the products on one grid, and the measures that were taken of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Comparison", "Product"]
+
+WEIGHTINGS = ("natural", "briggs")
+
+
+@dataclass(frozen=True)
+class Product:
+    """What one imager made, on the grid of the comparison; images are float64 (nx, ny), indexed [ix, iy].
+
+    Attributes
+    ----------
+    name : str
+        Unique among the products, e.g. 'tsara'.
+    model : ndarray
+        Jy/pixel.
+    residual, restored : dict
+        Weighting ('natural', 'briggs') → image in Jy/beam; all products with one operator and the same weights. Empty
+        when there are no visibilities to make them of.
+    parameters : dict
+        Task parameters found in the history of the image, name → text.
+    record : dict
+        What tsara recorded of the run ('history', 'bounds', 'blocks', 'reweightings' as in its return dictionary);
+        empty for other imagers.
+    """
+
+    name: str
+    model: np.ndarray
+    residual: dict[str, np.ndarray] = field(default_factory=dict)
+    restored: dict[str, np.ndarray] = field(default_factory=dict)
+    parameters: dict[str, str] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Several products and what was measured.
+
+    Attributes
+    ----------
+    products : tuple of Product
+    cell_arcsec : (float, float)
+        Pixel size along x and y, both positive; x runs to the west.
+    centre_deg : (float, float)
+        Right ascension and declination of pixel (nx//2, ny//2).
+    beams : dict
+        Weighting → (major, minor) in arcsec FWHM and position angle in degrees from north through east.
+    truth : ndarray or None
+        Jy/pixel.
+    support : bool ndarray
+        Where the source is.
+    regions : dict
+        Name → bool mask (nx, ny).
+    measures : dict
+        Plain numbers, strings, lists and dicts only:
+        `products` → name → {flux_jy, peak_jy_per_pixel, negative_jy, mdr, fwhm_recovered_arcsec, regions → {name →
+        {flux_jy, error_jy}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness, chi_square →
+        [of each block]}, truth → {snr, log_snr, ssim, snr_at_scale → {arcsec → dB}}} and
+        `similarity` → weighting → {'one|other' → S in dB}; what could not be measured is left out.
+    versions : dict
+        Package → version.
+    notes : tuple of str
+        Warnings for the reader.
+    """
+
+    products: tuple[Product, ...]
+    cell_arcsec: tuple[float, float]
+    centre_deg: tuple[float, float]
+    beams: dict[str, tuple[float, float, float]]
+    truth: np.ndarray | None
+    support: np.ndarray
+    regions: dict[str, np.ndarray]
+    measures: dict[str, Any]
+    versions: dict[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
