@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-__all__ = ["ImageGrid", "Output", "Selection", "SolverOptions", "Weighting"]
+__all__ = ["Comparing", "ImageGrid", "Output", "Selection", "SolverOptions", "Weighting"]
 
 SARA_BASES = ("dirac", "db1", "db2", "db3", "db4", "db5", "db6", "db7", "db8")
 
@@ -100,3 +100,17 @@ class Output:
     restoringbeam: tuple[str, ...] | None = ()
     savemodel: str = "none"
     history: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Comparing:
+    """What to compare, named after the task parameters of saracompare, which describe them."""
+
+    models: tuple[str, ...]
+    names: tuple[str, ...] = ()
+    truth: str = ""
+    regions: tuple[str, ...] = ()
+    support: str = ""
+    threshold: float = 1e-3
+    robust: float = -1.0
+    nthreads: int = 1

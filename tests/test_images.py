@@ -274,11 +274,13 @@ def test_products_replace_an_older_set_only_when_complete(tmp_path):
         raise RuntimeError("on the way")
     assert sorted(os.listdir(tmp_path)) == ["run.image", "run.psf"]
     assert os.listdir(root + ".psf") == ["old"]
+    (tmp_path / "run.sara.json").touch()
     with new_products(root) as scratch:
         os.mkdir(scratch + ".psf")
     assert os.listdir(tmp_path) == ["run.psf"]
     assert os.listdir(root + ".psf") == []
-    assert existing_products(root) == [root + ".psf"]
+    (tmp_path / "run.sara.json").touch()
+    assert existing_products(root) == [root + ".psf", root + ".sara.json"]
     remove_products(root)
     assert existing_products(root) == []
 

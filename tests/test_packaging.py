@@ -28,7 +28,7 @@ ROOMS = {
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
     "private": {
         "casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.resources", "casa_sara.solver",
-        "casa_sara.casa", "numpy", "casashell", *CASA,
+        "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
     },
     "interrupt": set(),
     "resources": set(),
@@ -36,17 +36,19 @@ ROOMS = {
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
     "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
-    "casa": {"casa_sara", "casa_sara.options", "casa_sara.visibilities", "numpy", *CASA},
+    "casa": {"casa_sara", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
     "operators": {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },
     "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
-    "analysis": {"numpy", "scipy", "astropy", "matplotlib"},
+    "analysis": {"numpy", "scipy", "astropy", "regions", "matplotlib"},
+    "jsonfile": set(),
 }
 LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
+ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.jsonfile", "numpy", *NUMERICS}
 ROOMS["demo"] = {"casa_sara", "casa_sara.casa", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS, *CASA}
 
 

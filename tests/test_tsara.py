@@ -1,6 +1,7 @@
 """The task as a user calls it: MeasurementSet in, CASA images and a dictionary out."""
 
 import hashlib
+import json
 import shutil
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from simulated_ms import add_column, edit, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import tsara
+from casa_sara import jsonfile, tsara
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER
 
 CELL_RAD = np.radians(1.0 / 3600)
@@ -20,6 +21,7 @@ SKY = [(1.0, -12 * CELL_RAD, 7 * CELL_RAD), (0.4, 9 * CELL_RAD, -10 * CELL_RAD)]
 ]
 FLUX = sum(component[0] for component in SKY)
 PRODUCTS = ("model", "psf", "residual", "image", "sumwt", "pb")
+RECORD = "source.sara.json"
 GRID = dict(imsize=128, cell="0.5arcsec", datacolumn="data")
 
 
@@ -73,7 +75,7 @@ def test_products_are_there_whole_and_finite(run):
     _, name, *_ = run
     for product in PRODUCTS:
         assert np.isfinite(_pixels(f"{name}.{product}")).all(), product
-    assert sorted(path.name for path in Path(name).parent.iterdir()) == sorted(f"source.{p}" for p in PRODUCTS)
+    assert sorted(path.name for path in Path(name).parent.iterdir()) == sorted([RECORD, *(f"source.{p}" for p in PRODUCTS)])
     assert _pixels(name + ".psf").max() == pytest.approx(1.0, abs=1e-5)
     # restored image: the model in the beam and the residual; noise of the residual is the thermal one
     residual = _pixels(name + ".residual")
@@ -97,6 +99,23 @@ def test_the_dictionary_is_tcleans_with_a_sara_record(run):
     assert set(sara["chosen"]) == set(sara["why"])
     assert sara["history"]["iteration"].size == result["iterdone"]
     assert sara["bounds"][0]["iteration"] == 0 and len(sara["reweightings"]) > 3
+
+
+def test_the_record_is_kept_beside_the_images(run):
+    result, name, *_ = run
+    kept = json.loads(Path(name + ".sara.json").read_text())
+    assert kept.keys() == result["sara"].keys()
+    assert kept["history"]["residual_norm"] == result["sara"]["history"]["residual_norm"].tolist()
+    assert kept["bounds"] == jsonfile.plain(result["sara"]["bounds"]) and kept["blocks"] == result["sara"]["blocks"]
+
+
+def test_the_record_alone_is_a_product_and_is_replaced(vis, tmp_path):
+    record = tmp_path / "try.sara.json"
+    record.write_text("old")
+    with pytest.raises(FileExistsError, match="try.sara.json exist"):
+        tsara(vis=vis, imagename=str(tmp_path / "try"), niter=0, **GRID)
+    tsara(vis=vis, imagename=str(tmp_path / "try"), niter=5, overwrite=True, **GRID)
+    assert json.loads(record.read_text())["history"]["iteration"] == [1, 2, 3, 4, 5]
 
 
 def test_history_says_version_and_every_parameter(run):

@@ -1,10 +1,19 @@
-"""How good an image is: comparisons with a known truth, smoothing to a beam, noise and dynamic range."""
+"""How good an image is: the measures of Dabbech et al. (2018), comparisons with a truth, flux and resolution.
+
+All take plain arrays, indexed [ix, iy] with ix to the west and iy to the north.
+"""
 
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
-__all__ = ["snr", "log_snr", "smooth", "dynamic_range"]
+__all__ = [
+    "beam_pixels", "dynamic_range", "integrated_flux", "isolated_point", "log_snr", "model_dynamic_range", "point_width",
+    "similarity", "smooth", "snr", "snr_at_scale", "ssim",
+]
+
+FWHM_PER_SIGMA = np.sqrt(8 * np.log(2))
 
 
 def snr(truth, model) -> float:
@@ -32,7 +41,7 @@ def log_snr(truth, model, dynamic_range=1e3) -> float:
     return snr(*(np.log1p(scale * np.clip(image, 0, None)) / np.log1p(dynamic_range) for image in (truth, model)))
 
 
-def smooth(image, fwhm, position_angle_deg=0.0) -> np.ndarray:
+def smooth(image, fwhm, position_angle_deg=0.0, cell=(1.0, 1.0)) -> np.ndarray:
     """Convolve an image with a Gaussian of unit integral (the unit stays, Jy/pixel for a model).
 
     Outside of the image is zero.
@@ -42,9 +51,11 @@ def smooth(image, fwhm, position_angle_deg=0.0) -> np.ndarray:
     image : array_like (nx, ny)
         Indexed [ix, iy], ix to the west and iy to the north.
     fwhm : float or (float, float)
-        Full width at half maximum in pixels: of a round Gaussian, or of the major and minor axis.
+        Full width at half maximum in the unit of `cell`: of a round Gaussian, or of the major and minor axis.
     position_angle_deg : float
         Of the major axis, from north through east.
+    cell : (float, float)
+        Pixel size; by default the width is in pixels.
 
     Returns
     -------
@@ -52,8 +63,8 @@ def smooth(image, fwhm, position_angle_deg=0.0) -> np.ndarray:
     """
     image = np.asarray(image, float)
     major, minor = np.broadcast_to(fwhm, 2)
-    padded = [n + int(np.ceil(2 * major)) for n in image.shape]
-    kx, ky = np.fft.fftfreq(padded[0])[:, None], np.fft.rfftfreq(padded[1])[None, :]
+    padded = [n + int(np.ceil(2 * major / size)) for n, size in zip(image.shape, cell)]
+    kx, ky = np.fft.fftfreq(padded[0], cell[0])[:, None], np.fft.rfftfreq(padded[1], cell[1])[None, :]
     sin, cos = np.sin(np.deg2rad(position_angle_deg)), np.cos(np.deg2rad(position_angle_deg))
     along, across = ky * cos - kx * sin, kx * cos + ky * sin
     transfer = np.exp(-(np.pi**2) * ((major * along) ** 2 + (minor * across) ** 2) / (4 * np.log(2)))
@@ -61,13 +72,178 @@ def smooth(image, fwhm, position_angle_deg=0.0) -> np.ndarray:
     return smoothed[: image.shape[0], : image.shape[1]]
 
 
+def snr_at_scale(truth, model, fwhm, cell=(1.0, 1.0)) -> float:
+    """Return the SNR in dB of two images that are both smoothed with a round Gaussian; FWHM in the unit of `cell`."""
+    truth, model = _alike(truth, model)
+    return snr(*(smooth(image, fwhm, 0.0, cell) for image in (truth, model)))
+
+
+def similarity(one, other) -> float:
+    """Return S = 20 log10(max(‖one‖, ‖other‖) / ‖one − other‖) in dB, infinite for equal images.
+
+    Parameters
+    ----------
+    one, other : array_like
+        Images of one shape and unit; the paper takes models smoothed with the CLEAN beam.
+
+    Raises
+    ------
+    ValueError
+        The shapes differ.
+    """
+    one, other = _alike(one, other, "one", "other")
+    difference = np.linalg.norm(one - other)
+    if difference == 0:
+        return float("inf")
+    return float(20 * np.log10(max(np.linalg.norm(one), np.linalg.norm(other)) / difference))
+
+
 def dynamic_range(restored, residual) -> float:
-    """Return the peak of the restored image over the rms of the residual image, blank pixels left out."""
-    return float(np.nanmax(restored) / np.sqrt(np.nanmean(np.square(residual))))
+    """Return DR = max(restored) / standard deviation of the residual, NaN (blank) pixels left out; one unit."""
+    return float(np.nanmax(restored) / np.nanstd(residual))
 
 
-def _alike(truth, model):
+def model_dynamic_range(model, support) -> float:
+    """Return MDR = max(model) / brightest pixel outside the support of the source, infinite if that is not positive.
+
+    Parameters
+    ----------
+    model : array_like (nx, ny)
+    support : bool array_like (nx, ny)
+        Where the source is.
+
+    Raises
+    ------
+    ValueError
+        The shapes differ, or the support is empty or the whole image.
+    """
+    model, support = _alike(model, support, "model", "support")
+    support = support > 0
+    if support.all() or not support.any():
+        raise ValueError(f"support holds {support.sum()} of {support.size} pixels: it takes some, and not all")
+    outside = model[~support].max()
+    return float(model.max() / outside) if outside > 0 else float("inf")
+
+
+def beam_pixels(fwhm, cell=(1.0, 1.0)) -> float:
+    """Return the solid angle of a Gaussian beam in pixels; (major, minor) FWHM and cell (x, y) in one unit."""
+    return float(np.pi * fwhm[0] * fwhm[1] / (4 * np.log(2) * cell[0] * cell[1]))
+
+
+def integrated_flux(image, mask, unit="Jy/pixel", beam=None, rms=None) -> tuple[float, float | None]:
+    """Sum an image over a region.
+
+    Parameters
+    ----------
+    image : array_like (nx, ny)
+    mask : bool array_like (nx, ny)
+        The region.
+    unit : {'Jy/pixel', 'Jy/beam'}
+    beam : float
+        Solid angle of the beam in pixels, for Jy/beam.
+    rms : float
+        Noise in Jy/beam.
+
+    Returns
+    -------
+    flux : float
+        Jy.
+    error : float or None
+        rms·√N_beams in Jy, N_beams being the number of beams in the region; None for a model, or without rms.
+
+    Raises
+    ------
+    ValueError
+        The region is empty or of another shape, the unit is another one, or the beam is missing.
+    """
+    image, mask = _alike(image, mask, "image", "mask")
+    if not mask.any():
+        raise ValueError("mask is empty: it takes one pixel or more")
+    flux = float(image[mask > 0].sum())
+    if unit == "Jy/pixel":
+        return flux, None
+    if unit != "Jy/beam":
+        raise ValueError(f"unit = '{unit}': should be 'Jy/pixel' or 'Jy/beam'")
+    if not (beam and beam > 0):
+        raise ValueError(f"beam = {beam!r}: an image in Jy/beam needs the solid angle of its beam in pixels")
+    error = None if rms is None else float(rms * np.sqrt((mask > 0).sum() / beam))
+    return flux / beam, error
+
+
+def ssim(truth, model, value_range, sigma=1.5) -> float:
+    """Return the mean structural similarity (Wang et al. 2004), 1 for equal images.
+
+    Parameters
+    ----------
+    truth, model : array_like (nx, ny)
+        Images of one shape and unit.
+    value_range : float
+        The range L of the values, in the same unit; K1 = 0.01, K2 = 0.03.
+    sigma : float
+        Of the Gaussian window in pixels, which is cut at 3.5 sigma; the mean leaves out its half width at the edges.
+    """
+    truth, model = _alike(truth, model)
+    half = int(3.5 * sigma + 0.5)
+    if min(truth.shape) <= 2 * half:
+        raise ValueError(f"images of {truth.shape} pixels are too small for a window of {2 * half + 1}")
+
+    def local(image):
+        return gaussian_filter(image, sigma, truncate=3.5)[half:-half, half:-half]
+
+    c1, c2 = (0.01 * value_range) ** 2, (0.03 * value_range) ** 2
+    m1, m2 = local(truth), local(model)
+    v1, v2, v12 = local(truth**2) - m1**2, local(model**2) - m2**2, local(truth * model) - m1 * m2
+    return float(np.mean((2 * m1 * m2 + c1) * (2 * v12 + c2) / ((m1**2 + m2**2 + c1) * (v1 + v2 + c2))))
+
+
+def isolated_point(truth, guard=4) -> tuple[int, int] | None:
+    """Return the brightest pixel [ix, iy] that is alone in a square of 2·guard + 1 pixels, None if there is none."""
+    truth = np.asarray(truth, float)
+    nx, ny = truth.shape
+    for flat in np.argsort(truth, axis=None)[::-1][:100]:
+        ix, iy = np.unravel_index(flat, truth.shape)
+        if truth[ix, iy] <= 0:
+            return None
+        if guard <= ix < nx - guard and guard <= iy < ny - guard:
+            around = truth[ix - guard : ix + guard + 1, iy - guard : iy + guard + 1]
+            if np.abs(around).sum() - truth[ix, iy] <= 1e-3 * truth[ix, iy]:
+                return int(ix), int(iy)
+    return None
+
+
+def point_width(model, pixel, half_side, cell=(1.0, 1.0)) -> float | None:
+    """Return the FWHM that a point source was recovered with, from the second moments of a square around it.
+
+    The geometric mean of both axes, as the covariance's determinant gives it; negative pixels count as zero. A source
+    that is one pixel has the width zero.
+
+    Parameters
+    ----------
+    model : array_like (nx, ny)
+    pixel : (int, int)
+        Where the point source is.
+    half_side : int
+        The square has 2·half_side + 1 pixels, less at the edge.
+    cell : (float, float)
+        Pixel size, which sets the unit of the width.
+
+    Returns
+    -------
+    float, or None where the square is empty
+    """
+    low = [max(centre - half_side, 0) for centre in pixel]
+    part = np.clip(np.asarray(model, float)[low[0] : pixel[0] + half_side + 1, low[1] : pixel[1] + half_side + 1], 0, None)
+    flux = part.sum()
+    if not flux > 0:
+        return None
+    x, y = (axis * size for axis, size in zip(np.indices(part.shape), cell))
+    x, y = (axis - (axis * part).sum() / flux for axis in (x, y))
+    xx, yy, xy = ((product * part).sum() / flux for product in (x * x, y * y, x * y))
+    return float(FWHM_PER_SIGMA * max(xx * yy - xy * xy, 0.0) ** 0.25)
+
+
+def _alike(truth, model, first="truth", second="model"):
     truth, model = np.asarray(truth, float), np.asarray(model, float)
     if truth.shape != model.shape:
-        raise ValueError(f"truth has shape {truth.shape} and model {model.shape}: they must be the same")
+        raise ValueError(f"{first} has shape {truth.shape} and {second} {model.shape}: they must be the same")
     return truth, model

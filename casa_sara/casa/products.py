@@ -1,4 +1,4 @@
-"""The images of one run under one name: .psf .residual .model .image .sumwt .pb."""
+"""What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, and the record .sara.json."""
 
 from __future__ import annotations
 
@@ -14,20 +14,23 @@ from casa_sara.casa.images import write_image
 from casa_sara.casa.restore import restore
 from casa_sara.casa.tools import opened
 
-__all__ = ["check_imagename", "existing_products", "history_lines", "new_products", "remove_products", "write_products"]
+__all__ = [
+    "RECORD", "check_imagename", "existing_products", "history_lines", "new_products", "remove_products", "write_products",
+]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
+RECORD = ".sara.json"  # written last, by the task
 
 
 def existing_products(imagename):
     """Return the paths of the products that stand under this name."""
-    return [imagename + suffix for suffix in PRODUCTS if os.path.lexists(imagename + suffix)]
+    return [imagename + suffix for suffix in (*PRODUCTS, RECORD) if os.path.lexists(imagename + suffix)]
 
 
 def remove_products(imagename):
     """Remove the products that stand under this name."""
     for path in existing_products(imagename):
-        shutil.rmtree(path)
+        shutil.rmtree(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
 
 
 def check_imagename(imagename, shape):

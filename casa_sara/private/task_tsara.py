@@ -6,9 +6,10 @@ import math
 from typing import Any
 
 import casa_sara
+from casa_sara import jsonfile
 from casa_sara.casa import log
 from casa_sara.casa.modelcolumn import check_model_column_writable
-from casa_sara.casa.products import check_imagename, existing_products, history_lines
+from casa_sara.casa.products import RECORD, check_imagename, existing_products, history_lines
 from casa_sara.casa.quantities import radians
 from casa_sara.casa.restore import restoring_beam_words
 from casa_sara.imaging import make_image
@@ -33,6 +34,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     if output.savemodel == "modelcolumn":
         check_model_column_writable(selection)
     result = make_image(selection, grid, weighting, options, output)
+    jsonfile.save(output.imagename + RECORD, summary(result, options, full=True)["sara"])
     return summary(result, options, parameters["fullsummary"])
 
 

@@ -156,6 +156,7 @@ class _tsara:
           out/try.image     model convolved with the restoring beam, plus residual (Jy/beam)
           out/try.pb        the primary beam
           out/try.sumwt     the sum of the imaging weights
+          out/try.sara.json the record 'sara' of the returned dictionary, with every iteration
         Images that exist are left alone, and the task refuses to start, unless restart or
         overwrite says otherwise.
 

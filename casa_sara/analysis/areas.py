@@ -1,0 +1,169 @@
+"""Regions of the sky as masks: circles in plain words, CRTF and DS9 files or lines."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.coordinates import Angle, SkyCoord
+from astropy.wcs import WCS
+from regions import CirclePixelRegion, CircleSkyRegion, PixCoord, PixelRegion, Regions, SkyRegion
+
+__all__ = ["Frame", "region_masks"]
+
+RIGHT = "a circle as '19h59m28.3s +40d44m02s 1.5arcsec', or a CRTF or DS9 file or line; 'name = ' may stand before it"
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where an image is: `centre_deg` (ICRS or J2000) of pixel (nx//2, ny//2), `cell_arcsec` (x, y), `shape`; SIN projection.
+
+    `radesys` is FITS's word for the frame: 'FK5' is CASA's J2000.
+    """
+
+    centre_deg: tuple[float, float]
+    cell_arcsec: tuple[float, float]
+    shape: tuple[int, int]
+    radesys: str = "FK5"
+
+    @property
+    def wcs(self) -> WCS:
+        """The astropy WCS; x runs to the west."""
+        wcs = WCS(naxis=2)
+        wcs.wcs.ctype = ["RA---SIN", "DEC--SIN"]
+        wcs.wcs.radesys = self.radesys
+        wcs.wcs.equinox = 2000.0
+        wcs.wcs.crval = self.centre_deg
+        wcs.wcs.crpix = [n // 2 + 1 for n in self.shape]
+        wcs.wcs.cdelt = [-self.cell_arcsec[0] / 3600, self.cell_arcsec[1] / 3600]
+        return wcs
+
+
+def region_masks(texts, frame: Frame, parameter="regions") -> dict[str, np.ndarray]:
+    """Return the regions as masks, by name.
+
+    A region's name is what stands before ' = ', else its label in the file, else the text or the file's name; a
+    number is added where a name comes again. A pixel belongs to a region when its centre does.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        Each is a circle 'RA DEC RADIUS', a line in CRTF or DS9 syntax, or the path of a file of such lines.
+    frame : Frame
+    parameter : str
+        Task parameter, for messages.
+
+    Returns
+    -------
+    dict of bool (nx, ny)
+
+    Raises
+    ------
+    ValueError, FileNotFoundError
+        A text is no region, a file is absent, a region is not on the sky, excludes, holds no pixel, or reaches beyond
+        the image.
+    """
+    masks: dict[str, np.ndarray] = {}
+    for text in texts:
+        given, _, body = text.rpartition(" = ") if " = " in text and not os.path.exists(text) else ("", "", text)
+        found = _parse(body.strip(), text, parameter)
+        for region in found:
+            label = region.meta.get("label") or region.meta.get("text") or _short(body.strip())
+            name = _unused(given.strip() or str(label).strip("{}'\""), masks)
+            masks[name] = _mask(region, frame, f"{parameter} = '{text}'")
+    return masks
+
+
+def _parse(body, text, parameter):
+    """Return the regions that one text stands for."""
+    wrong = f"{parameter} = '{text}' is not a region: should be {RIGHT}"
+    if os.path.isfile(body):
+        with open(body, encoding="utf-8") as file:
+            body = file.read()
+    elif "[[" not in body and "(" not in body:
+        return [_circle(body, wrong)]
+    style = "crtf" if body.startswith("#CRTF") or "[[" in body else "ds9"
+    if style == "crtf" and not body.startswith("#CRTF"):
+        body = f"#CRTFv0\n{body}" if "coord" in body else f"#CRTFv0\nglobal coord=J2000\n{body}"
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # a line that is not understood must not be left out
+            found = list(Regions.parse(body, format=style))
+    except Exception as error:  # of many kinds, from the parsers
+        raise ValueError(f"{wrong} ({error})") from None
+    if not found:
+        raise ValueError(f"{wrong}; it holds none")
+    for region in found:
+        if not isinstance(region, SkyRegion):
+            raise ValueError(f"{parameter} = '{text}' is in pixels, of an unknown image: should be in right ascension and "
+                             "declination")
+        if not region.meta.get("include", True):
+            raise ValueError(f"{parameter} = '{text}' excludes a part of the sky: should only hold regions to measure in")
+    return found
+
+
+def _circle(body, wrong):
+    """Return the circle 'RA DEC RADIUS'."""
+    words = body.split()
+    if len(words) != 3:
+        if body.endswith((".crtf", ".reg", ".txt")):
+            raise FileNotFoundError(f"{wrong.split(' is not')[0]} does not exist: should be {RIGHT}")
+        raise ValueError(wrong)
+    try:
+        centre, radius = SkyCoord(f"{words[0]} {words[1]}"), Angle(words[2])
+    except Exception as error:  # of many kinds, from the parsers
+        raise ValueError(f"{wrong} ({error})") from None
+    if not radius.deg > 0:
+        raise ValueError(f"{wrong}; the radius should be positive")
+    return CircleSkyRegion(centre, radius)
+
+
+def _mask(region, frame, given):
+    """Return one region as a mask."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        pixel = _on_pixels(region, frame)
+    box = pixel.bounding_box if np.isfinite(_centre(pixel)).all() else None
+    nx, ny = frame.shape
+    if box is None or box.ixmin >= nx or box.iymin >= ny or box.ixmax <= 0 or box.iymax <= 0:
+        raise ValueError(f"{given} is outside the image, which is centred on {_spell(frame)}")
+    if box.ixmin < 0 or box.iymin < 0 or box.ixmax > nx or box.iymax > ny:
+        raise ValueError(f"{given} reaches beyond the image, which is centred on {_spell(frame)}: should be inside")
+    x, y = np.indices(frame.shape)
+    mask = np.asarray(pixel.contains(PixCoord(x, y)), bool)
+    if not mask.any():
+        raise ValueError(f"{given} is empty: no pixel centre is inside, the pixels are {frame.cell_arcsec[0]:.3g} arcsec")
+    return mask
+
+
+def _on_pixels(region, frame) -> PixelRegion:
+    """Return the region in pixels; a circle by its radius, as pixels are square."""
+    if isinstance(region, CircleSkyRegion) and np.isclose(*frame.cell_arcsec):
+        x, y = frame.wcs.world_to_pixel(region.center)
+        return CirclePixelRegion(PixCoord(float(x), float(y)), region.radius.to_value("arcsec") / frame.cell_arcsec[0])
+    return region.to_pixel(frame.wcs)
+
+
+def _centre(pixel):
+    """Return the pixel coordinates of a region, of its corners where it has no centre."""
+    place = pixel.center if hasattr(pixel, "center") else pixel.vertices if hasattr(pixel, "vertices") else None
+    return np.array([0.0]) if place is None else np.array([place.x, place.y], float)
+
+
+def _spell(frame):
+    extent = " x ".join(f"{n * cell:.4g}" for n, cell in zip(frame.shape, frame.cell_arcsec))
+    return f"{SkyCoord(*frame.centre_deg, unit='deg').to_string('hmsdms', precision=2)} and has {extent} arcsec"
+
+
+def _short(text):
+    return os.path.splitext(os.path.basename(text))[0] if os.path.isfile(text) else text
+
+
+def _unused(name, masks):
+    number, unused = 1, name
+    while unused in masks:
+        number += 1
+        unused = f"{name} {number}"
+    return unused

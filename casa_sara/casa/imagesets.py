@@ -1,0 +1,126 @@
+"""What one imager left under one root: the model, and beside it residual, beam, history and record."""
+
+from __future__ import annotations
+
+import ast
+import os
+from dataclasses import dataclass, field
+from typing import Any
+
+from casa_sara import jsonfile
+from casa_sara.casa.products import RECORD
+from casa_sara.casa.skyimage import SkyImage, read_sky_image
+
+__all__ = ["ImageSet", "check_same_data", "read_image_set"]
+
+_SUFFIXES = ("", ".fits")
+_NAMES = (".model", ".model.fits", ".fits")
+
+
+@dataclass(frozen=True)
+class ImageSet:
+    """The images of one run.
+
+    Attributes
+    ----------
+    name : str
+        How the comparison calls it.
+    model : SkyImage
+        Jy/pixel.
+    residual : SkyImage or None
+        Jy/beam.
+    beam : (float, float, float) or None
+        Of the restored image, else of the residual or the PSF: arcsec, arcsec, degrees.
+    parameters : dict
+        Task parameters in the history of the images.
+    record : dict
+        What tsara recorded, else empty.
+    """
+
+    name: str
+    model: SkyImage
+    residual: SkyImage | None = None
+    beam: tuple[float, float, float] | None = None
+    parameters: dict[str, str] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def weighting(self) -> str:
+        """'natural', 'uniform' or 'briggs' as the history says, '' when it does not."""
+        return self.parameters.get("weighting", "")
+
+
+def read_image_set(given, name=""):
+    """Read what stands under one name.
+
+    Parameters
+    ----------
+    given : str
+        Common root of the images, the model image itself, or a FITS file.
+    name : str
+        What to call it; '' is the root without its folder.
+
+    Returns
+    -------
+    ImageSet
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        There is no model, or an image is not as it should be.
+    """
+    path, root = _model_path(given)
+    model = read_sky_image(path, "models", ("Jy/pixel",))
+    beside = {kind: _beside(root, kind) for kind in (".residual", ".image", ".psf")}
+    units = {".residual": ("Jy/beam", ""), ".image": ("Jy/beam",), ".psf": ("Jy/beam", "")}
+    images = {kind: read_sky_image(found, "models", units[kind]) for kind, found in beside.items() if found}
+    beams = [images[kind].beam for kind in (".image", ".residual", ".psf") if kind in images]
+    parameters = {}
+    for image in (*images.values(), model):
+        parameters |= image.parameters
+    record = root + RECORD
+    return ImageSet(name or os.path.basename(root), model, images.get(".residual"), next(filter(None, beams), None),
+                    parameters, jsonfile.load(record) if os.path.isfile(record) else {})
+
+
+def check_same_data(sets):
+    """Raise ValueError when the histories of the products name different MeasurementSets."""
+    first, *others = [(one, _data(one)) for one in sets if _data(one)] or [(None, None)]
+    for other, data in others:
+        if data != first[1]:
+            pair = [f"'{one.name}' ({', '.join(sorted(names))})" for one, names in (first, (other, data))]
+            raise ValueError(f"models: {' and '.join(pair)} are made of different data, so their residuals cannot be "
+                             "compared: give vis, and all are held against the same visibilities")
+
+
+def _model_path(given):
+    """Return the path of the model image and the root of the names beside it."""
+    given = given.rstrip("/")
+    if os.path.exists(given):
+        for suffix in (".model.fits", ".model", ".fits"):
+            if given.endswith(suffix):
+                return given, given.removesuffix(suffix)
+        if os.path.isfile(os.path.join(given, "table.dat")) or os.path.isfile(given):
+            return given, given
+    for suffix in _NAMES:
+        if os.path.exists(given + suffix):
+            return given + suffix, given
+    tried = ", ".join(f"'{given}{suffix}'" for suffix in _NAMES)
+    raise FileNotFoundError(f"models = '{given}': neither it nor {tried} exists: should be the images' common root, a model "
+                            "image or a FITS file")
+
+
+def _beside(root, kind):
+    """Return the path of one more image of the root, '' where there is none."""
+    return next((root + kind + suffix for suffix in _SUFFIXES if os.path.exists(root + kind + suffix)), "")
+
+
+def _data(one):
+    """Return the names of the MeasurementSets in a history, without their folders."""
+    text = one.parameters.get("vis", "")
+    try:
+        value = ast.literal_eval(text)
+    except (SyntaxError, ValueError):
+        value = text
+    names = value if isinstance(value, (list, tuple)) else [value]
+    return {os.path.basename(str(name).rstrip("/")) for name in names if str(name)}

@@ -1,0 +1,129 @@
+"""Images on the pixels of another image: models with their flux kept, images in Jy/beam interpolated."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from casa_sara.casa.imageplane import slabs
+
+__all__ = ["PixelMap", "corners", "interpolated", "on_plane"]
+
+_SAME_PIXEL = 1e-3  # pixels; two grids whose corners agree so well are one
+
+
+class PixelMap:
+    """Where the pixels of one image stand in the pixels of another.
+
+    Parameters
+    ----------
+    csys : casatools.coordsys
+        Of the one image; it is changed.
+    plane : object with `csys`, the record of a coordinate system
+        The other image.
+    """
+
+    def __init__(self, csys, plane):
+        import casatools
+
+        self._from, self._to = csys, casatools.coordsys()
+        self._to.fromrecord(plane.csys)
+        self._rest = np.asarray(csys.referencepixel()["numeric"])[2:]
+        self._values = np.asarray(self._to.referencevalue()["numeric"])[2:]
+        self._turn_to(self._to.referencecode("direction")[0], plane.csys["obsdate"])
+
+    def _turn_to(self, frame, date):
+        """Convert directions to this frame; coordsys does it without the date, which moves B1950 by 0.1 arcsec."""
+        import casatools
+
+        me, center = casatools.measures(), self._from.referencevalue("m")["measure"]["direction"]
+        me.doframe(date)
+        exact = me.measure(center, frame)
+        self._from.setconversiontype(direction=frame)
+        found = self._from.toworld(self._from.referencepixel()["numeric"])["numeric"][:2]
+        shift = np.array([exact["m0"]["value"], exact["m1"]["value"]]) - found
+        self._shift = np.array([np.remainder(shift[0] + np.pi, 2 * np.pi) - np.pi, shift[1]])[:, None]
+
+    def __call__(self, x, y):
+        """Return the pixel coordinates (2, N) of the pixel coordinates x, y (N,)."""
+        pixels = np.vstack([x, y, *(np.full(x.size, rest) for rest in self._rest)])
+        sky = self._from.toworldmany(pixels)["numeric"][:2] + self._shift
+        world = np.vstack([sky, *(np.full(x.size, value) for value in self._values)])
+        return self._to.topixelmany(world)["numeric"][:2]
+
+
+def corners(shape):
+    """Return the pixel coordinates (2, 4) of the corner pixels."""
+    nx, ny = shape
+    return np.array([[0, nx - 1, 0, nx - 1], [0, 0, ny - 1, ny - 1]], float)
+
+
+def on_plane(pixels, place, shape):
+    """Deposit the flux of an image (Jy/pixel) in the pixels of another.
+
+    Each pixel's flux is shared among the new pixels around its place; a pixel larger than the new ones is first cut
+    into parts. The total is kept but for what lies beyond the new image. On the same grid the pixels stay as they are.
+
+    Parameters
+    ----------
+    pixels : float32 (nx, ny)
+    place : PixelMap, from the pixels of this image to those of the other
+    shape : (int, int)
+        Of the other.
+
+    Returns
+    -------
+    float32, of this shape
+    """
+    nx, ny = pixels.shape
+    moved = place(*corners(pixels.shape))
+    if pixels.shape == tuple(shape) and np.abs(moved - corners(pixels.shape)).max() < _SAME_PIXEL:
+        return pixels
+    size = [np.linalg.norm(moved[:, k] - moved[:, 0]) / max(n - 1, 1) for k, n in ((1, nx), (2, ny))]
+    parts = [max(1, int(np.ceil(2 * s))) for s in size]
+    cuts = [(np.arange(k) + 0.5) / k - 0.5 for k in parts]
+    model = np.zeros(shape, np.float64)
+    for rows in slabs(nx, ny * parts[0] * parts[1]):
+        x, y = np.nonzero(pixels[rows])
+        flux = pixels[rows][x, y] / (parts[0] * parts[1])
+        for dx in cuts[0]:
+            for dy in cuts[1]:
+                if flux.size:
+                    _deposit(model, place(x + rows.start + dx, y + dy), flux)
+    return model.astype(np.float32)
+
+
+def interpolated(pixels, place, shape):
+    """Interpolate an image in Jy/beam, whose values do not depend on the pixel size, at the pixels of another.
+
+    Parameters
+    ----------
+    pixels : real (nx, ny)
+    place : PixelMap, from the pixels of the other image to those of this one
+    shape : (int, int)
+        Of the other.
+
+    Returns
+    -------
+    float64, of this shape; NaN beyond this image
+    """
+    x, y = np.indices(shape).reshape(2, -1).astype(float)
+    moved = place(x, y)
+    if pixels.shape == tuple(shape) and np.abs(moved - [x, y]).max() < _SAME_PIXEL:
+        return pixels.astype(float)
+    edge = np.array(pixels.shape)[:, None] - 1
+    near = np.clip(moved, 0, edge)
+    values = map_coordinates(pixels.astype(float), near, order=3, mode="mirror")
+    values[(np.abs(moved - near) > 0.5).any(axis=0)] = np.nan
+    return values.reshape(shape)
+
+
+def _deposit(model, place, flux):
+    """Add each flux to the four pixels around its place, in proportion to the nearness."""
+    corner = np.floor(place).astype(int)
+    fraction = place - corner
+    for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        i, j = corner[0] + step[0], corner[1] + step[1]
+        share = flux * np.prod([f if s else 1 - f for s, f in zip(step, fraction)], axis=0)
+        inside = (i >= 0) & (i < model.shape[0]) & (j >= 0) & (j < model.shape[1])
+        np.add.at(model, (i[inside], j[inside]), share[inside])

@@ -1,0 +1,71 @@
+"""Records kept in files: JSON that any program reads, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from typing import Any
+
+__all__ = ["load", "plain", "save"]
+
+_WORDS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}  # JSON has no numbers for these
+
+
+def plain(value: Any) -> Any:
+    """Return `value` as dicts with text keys, lists, numbers, strings and None; arrays become lists."""
+    if isinstance(value, dict):
+        return {str(key): plain(entry) for key, entry in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    return [plain(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+
+
+def save(path: str | os.PathLike, value: Any) -> None:
+    """Write `value` to a new file, which takes its place when it is complete."""
+    folder, base = os.path.split(os.fspath(path))
+    handle, scratch = tempfile.mkstemp(prefix=f".{base}.", dir=folder or ".")
+    try:
+        with os.fdopen(handle, "w", encoding="utf-8") as file:
+            json.dump(_spelled(plain(value)), file, allow_nan=False, indent=1)
+            file.write("\n")
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(scratch, 0o666 & ~umask)  # mkstemp keeps it from everybody else
+        os.replace(scratch, path)
+    except BaseException:
+        os.unlink(scratch)
+        raise
+
+
+def load(path: str | os.PathLike) -> Any:
+    """Read what `save` wrote.
+
+    Raises
+    ------
+    ValueError
+        It is no JSON.
+    """
+    with open(path, encoding="utf-8") as file:
+        return _numbers(json.load(file))
+
+
+def _spelled(value: Any) -> Any:
+    """Return `value` with the numbers that JSON lacks as words."""
+    if isinstance(value, dict):
+        return {key: _spelled(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_spelled(entry) for entry in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value
+
+
+def _numbers(value: Any) -> Any:
+    """Return `value` with those words as numbers again."""
+    if isinstance(value, dict):
+        return {key: _numbers(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_numbers(entry) for entry in value]
+    return _WORDS.get(value, value) if isinstance(value, str) else value
