@@ -28,7 +28,7 @@ ROOMS = {
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
     "private": {
         "casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.resources", "casa_sara.solver",
-        "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
+        "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
     },
     "interrupt": set(),
     "resources": set(),
@@ -36,7 +36,7 @@ ROOMS = {
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
     "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
-    "casa": {"casa_sara", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
+    "casa": {"casa_sara", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
     "operators": {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },

@@ -82,12 +82,14 @@ def measure(products, cell_arcsec, beams, truth, support, regions, chi_square=No
 def _model(product, support):
     """Measures of the model alone."""
     model = product.model
-    return {
+    found = {
         "flux_jy": float(model.sum()),
         "peak_jy_per_pixel": float(model.max()),
         "negative_jy": float(model[model < 0].sum()),
-        "mdr": metrics.model_dynamic_range(model, support),
     }
+    if support.any() and not support.all():
+        found["mdr"] = metrics.model_dynamic_range(model, support)
+    return found
 
 
 def _residual(product, weighting):

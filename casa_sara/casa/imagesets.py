@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import ast
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from casa_sara import jsonfile
 from casa_sara.casa.products import RECORD
-from casa_sara.casa.skyimage import SkyImage, read_sky_image
+from casa_sara.casa.skyimage import SkyImage, read_header, read_sky_image
 
 __all__ = ["ImageSet", "check_same_data", "read_image_set"]
 
@@ -44,13 +44,17 @@ class ImageSet:
     parameters: dict[str, str] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
 
+    def called(self, name):
+        """Return the same with another name."""
+        return replace(self, name=name)
+
     @property
     def weighting(self) -> str:
         """'natural', 'uniform' or 'briggs' as the history says, '' when it does not."""
         return self.parameters.get("weighting", "")
 
 
-def read_image_set(given, name=""):
+def read_image_set(given, name="", with_residual=True):
     """Read what stands under one name.
 
     Parameters
@@ -59,6 +63,8 @@ def read_image_set(given, name=""):
         Common root of the images, the model image itself, or a FITS file.
     name : str
         What to call it; '' is the root without its folder.
+    with_residual : bool
+        Read the residual image, where there is one.
 
     Returns
     -------
@@ -71,16 +77,16 @@ def read_image_set(given, name=""):
     """
     path, root = _model_path(given)
     model = read_sky_image(path, "models", ("Jy/pixel",))
-    beside = {kind: _beside(root, kind) for kind in (".residual", ".image", ".psf")}
-    units = {".residual": ("Jy/beam", ""), ".image": ("Jy/beam",), ".psf": ("Jy/beam", "")}
-    images = {kind: read_sky_image(found, "models", units[kind]) for kind, found in beside.items() if found}
-    beams = [images[kind].beam for kind in (".image", ".residual", ".psf") if kind in images]
-    parameters = {}
-    for image in (*images.values(), model):
-        parameters |= image.parameters
+    found = _beside(root, ".residual")
+    residual = read_sky_image(found, "models", ("Jy/beam", "")) if found and with_residual else None
+    parameters, beams = {}, []
+    for kind in (".image", ".residual", ".psf"):
+        beam, of_image = read_header(_beside(root, kind)) if _beside(root, kind) else (None, {})
+        beams.append(beam)
+        parameters |= of_image
     record = root + RECORD
-    return ImageSet(name or os.path.basename(root), model, images.get(".residual"), next(filter(None, beams), None),
-                    parameters, jsonfile.load(record) if os.path.isfile(record) else {})
+    return ImageSet(name or os.path.basename(root), model, residual, next(filter(None, beams), None),
+                    parameters | model.parameters, jsonfile.load(record) if os.path.isfile(record) else {})
 
 
 def check_same_data(sets):

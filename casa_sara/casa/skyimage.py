@@ -12,7 +12,7 @@ from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.regrid import PixelMap, corners, interpolated, on_plane
 from casa_sara.casa.tools import opened
 
-__all__ = ["SkyImage", "SkyPlane", "read_sky_image"]
+__all__ = ["SkyImage", "SkyPlane", "beam_numbers", "read_header", "read_sky_image"]
 
 _SPELLINGS = {"jy/pixel": "Jy/pixel", "jy/pix": "Jy/pixel", "jy/beam": "Jy/beam", "jy/bm": "Jy/beam", "": ""}
 _PARAMETER = re.compile(r"(\w+)\s*=\s*(.*)")
@@ -121,8 +121,8 @@ def read_sky_image(name, parameter, units):
         A CASA image, or a FITS file.
     parameter : str
         Task parameter that named it, for messages.
-    units : sequence of str
-        What is right here: out of 'Jy/pixel', 'Jy/beam', ''.
+    units : sequence of str or None
+        What is right here: out of 'Jy/pixel', 'Jy/beam', ''; None takes any.
 
     Returns
     -------
@@ -145,14 +145,20 @@ def read_sky_image(name, parameter, units):
     except RuntimeError as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
     unit = _SPELLINGS.get(unit.lower(), unit)
-    if unit not in units:
+    if units is not None and unit not in units:
         right = " or ".join(f"'{word}'" for word in units if word)
         hint = "; the model is the image before it is convolved with the beam" if unit == "Jy/beam" else ""
         raise ValueError(f"{parameter} = '{name}' is in '{unit}': should be in {right}{hint}")
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
-    return SkyImage(name, pixels, unit, _beam(beam), SkyPlane(csys.torecord(), shape[:2]), _parameters(history))
+    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(csys.torecord(), shape[:2]), _parameters(history))
+
+
+def read_header(name):
+    """Return the beam of an image, None where it has none, and the task parameters in its history."""
+    with opened("image", name) as ia:
+        return beam_numbers(ia.restoringbeam()), _parameters(ia.history(list=False))
 
 
 def _check_axes(name, parameter, shape, csys):
@@ -165,7 +171,7 @@ def _check_axes(name, parameter, shape, csys):
         raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one channel")
 
 
-def _beam(record):
+def beam_numbers(record):
     """Return CASA's restoring beam as plain numbers, None where there is none."""
     import casatools
 

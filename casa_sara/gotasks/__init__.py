@@ -2,9 +2,10 @@
 
 import sys
 
+from casa_sara.gotasks.saracompare import saracompare
 from casa_sara.gotasks.tsara import tsara
 from casa_sara.private.shelltask import register
 
-__all__ = ["tsara"]
+__all__ = ["saracompare", "tsara"]
 
 register(sys.modules[__name__])

@@ -17,7 +17,7 @@ from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weigh
 from casa_sara.private.summary import summary
 from casa_sara.resources import available_cores
 
-__all__ = ["tsara"]
+__all__ = ["selection_of", "tsara"]
 
 ARCSEC = math.pi / 180 / 3600
 
@@ -25,7 +25,7 @@ ARCSEC = math.pi / 180 / 3600
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     log.info(f"casa_sara {casa_sara.__version__}")
-    selection = _selection(parameters)
+    selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
                           tuple(parameters["uvtaper"]))
@@ -38,7 +38,8 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     return summary(result, options, parameters["fullsummary"])
 
 
-def _selection(parameters):
+def selection_of(parameters: dict[str, Any]) -> Selection:
+    """Return the data selection in the parameters of a task."""
     vis = parameters["vis"]
     vis = (vis,) if isinstance(vis, str) else tuple(vis)
     chosen = {name: parameters[name] for name in Selection.PARAMETERS}

@@ -1,0 +1,249 @@
+"""The story of one comparison: read, one grid, one operator, measure."""
+
+from __future__ import annotations
+
+import os
+from importlib.metadata import version
+
+import numpy as np
+
+import casa_sara
+from casa_sara.analysis import metrics
+from casa_sara.analysis.areas import Frame, region_masks
+from casa_sara.analysis.comparison import Comparison, Product
+from casa_sara.analysis.measuring import measure, source_support
+from casa_sara.casa import log
+from casa_sara.casa.imageplane import define_image_plane
+from casa_sara.casa.imagesets import check_same_data, read_image_set
+from casa_sara.casa.ms import read_visibilities
+from casa_sara.casa.restore import fit_beam
+from casa_sara.casa.skyimage import SkyPlane, beam_numbers, read_sky_image
+from casa_sara.casa.weights import dirty_image, imaging_weights
+from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
+from casa_sara.visibilities import snapshot_blocks
+
+__all__ = ["compare_images"]
+
+IMAGE_EPS = 1e-6  # accuracy of the residual images
+LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a word
+ARCSEC = np.radians(1 / 3600)
+RADESYS = {"J2000": "FK5", "ICRS": "ICRS"}
+VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
+
+
+def compare_images(request: Comparing, selection: Selection | None = None, single: bool = False) -> Comparison:
+    """Compare what several imagers made of one sky.
+
+    The pixels of the first model are the common grid. With a selection of visibilities, the residual of every model is
+    made of them with one operator and one set of weights; without, the residual images beside the models are used.
+
+    Parameters
+    ----------
+    request : Comparing
+    selection : Selection, optional
+    single : bool
+        One product will do, for the report of one run.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    ValueError, FileNotFoundError
+        The products cannot be compared; the message names the task parameter.
+    """
+    # read
+    sets = _read(request, selection is None, 1 if single else 2)
+    first, notes = sets[0].model, []
+    if first.plane.frame not in RADESYS:
+        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000 or ICRS")
+    observed = _Observed(selection, first.plane, request, notes) if selection else None
+    # one grid
+    plane = observed.plane if observed else first.plane
+    models = {one.name: _on_grid(one.model, plane, first, "models", notes) for one in sets}
+    truth = None
+    if request.truth:
+        image = read_sky_image(request.truth, "truth", ("Jy/pixel",))
+        truth = _on_grid(image, plane, first, "truth", notes)
+    frame = Frame(tuple(float(x) for x in np.degrees(plane.centre)), tuple(c / ARCSEC for c in plane.cell_rad), plane.shape,
+                  RADESYS[plane.frame])
+    regions = region_masks(request.regions, frame)
+    # one operator
+    if observed:
+        beams = observed.beams
+        residuals, chi_square = {}, {}
+        for one in sets:
+            left = observed.minus(one.model, models[one.name])
+            residuals[one.name], chi_square[one.name] = observed.images(left), observed.chi_square(left)
+    else:
+        check_same_data(sets)
+        beams, residuals, chi_square = *_beside(sets, plane, notes), {}
+    # measure
+    products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
+    support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
+    measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
+    versions = {"casa_sara": casa_sara.__version__} | {name: version(name) for name in VERSIONS}
+    for note in notes:
+        log.warn(note)
+    return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures, versions,
+                      tuple(notes))
+
+
+def _read(request, with_residual, fewest):
+    """Read the products and name them apart."""
+    models, names = request.models, request.names
+    if len(models) < fewest:
+        raise ValueError(f"models = {list(models)}: should be {fewest} or more products to compare")
+    if names and len(names) != len(models):
+        raise ValueError(f"names = {list(names)}: {len(names)} for {len(models)} models; should be one for each, or none")
+    if len(set(names)) < len(names) or any("|" in name or not name.strip() for name in names):
+        raise ValueError(f"names = {list(names)}: should differ, not be empty, and hold no '|'")
+    sets = [read_image_set(given, name, with_residual) for given, name in zip(models, names or [""] * len(models))]
+    taken = set()
+    for number, one in enumerate(sets):
+        name = one.name.replace("|", "_")
+        tries = [name, os.path.normpath(models[number]).replace("|", "_")] + [f"{name} {n}" for n in range(2, len(sets) + 2)]
+        sets[number] = one.called(next(word for word in tries if word not in taken))
+        taken.add(sets[number].name)
+    return sets
+
+
+def _on_grid(image, plane, first, parameter, notes):
+    """Return a model on the common grid, and say what became of it."""
+    if not image.overlaps(plane):
+        raise ValueError(f"{parameter}: '{image.name}' does not overlap '{first.name}' on the sky: should be images of one "
+                         "field")
+    if not image.pixels.any():
+        raise ValueError(f"{parameter}: '{image.name}' is zero everywhere: should be a model with emission")
+    model = image.flux_on(plane)
+    total = float(np.abs(image.pixels).sum(dtype=float))
+    lost = 1 - float(np.abs(model).sum()) / total
+    if not model.any():
+        raise ValueError(f"{parameter}: '{image.name}' has no flux within '{first.name}': should be images of one field")
+    if model.shape != image.pixels.shape or not np.array_equal(model, image.pixels):
+        notes.append(f"'{image.name}' was put on the pixels of '{first.name}', its flux kept")
+        if lost > LOST:
+            notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies beyond '{first.name}'")
+    return model
+
+
+def _product(one, model, residuals, beams, cell_arcsec):
+    """Return a product with its restored images, model ∗ beam + residual."""
+    restored = {}
+    for weighting, residual in residuals.items():
+        *axes, angle = beams[weighting]
+        smoothed = metrics.smooth(model, axes, angle, cell_arcsec) * metrics.beam_pixels(axes, cell_arcsec)
+        restored[weighting] = smoothed + residual
+    return Product(one.name, model, residuals, restored, dict(one.parameters), dict(one.record))
+
+
+def _support(request, plane, frame, models, truth, beam, notes):
+    """Return where the source is, as a mask image, a region or the threshold says."""
+    text = request.support
+    if not text:
+        return source_support(models, truth, request.threshold, beam, frame.cell_arcsec)
+    if os.path.isdir(text) or text.endswith((".fits", ".mask")):
+        image = read_sky_image(text, "support", None)
+        support = np.nan_to_num(image.brightness_on(plane)) > 0.5 if image.overlaps(plane) else np.zeros(plane.shape, bool)
+    else:
+        support = np.any(list(region_masks([text], frame, "support").values()), axis=0)
+    if support.all() or not support.any():
+        raise ValueError(f"support = '{text}' holds {support.sum()} of {support.size} pixels of the image: should be a "
+                         "part of it, above 0.5 in a mask image")
+    outside = max(model[~support].max() / model.max() for model in models)
+    if outside > 0.5:
+        notes.append(f"support = '{text}' leaves out pixels of {100 * outside:.2g} % of a model's peak: is it the source?")
+    return support
+
+
+def _beside(sets, plane, notes):
+    """Return the beams and the residuals by product and weighting, of the images beside the models."""
+    beams, residuals = {}, {one.name: {} for one in sets}
+    for one in sets:
+        if one.residual is None:
+            notes.append(f"'{one.name}' has no residual image: give vis to have one made")
+            continue
+        if one.beam is None:
+            raise ValueError(f"models: '{one.residual.name}' has no beam, nor has an image or PSF beside it: give vis, or "
+                             "put the restored image there")
+        image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
+        if not np.isfinite(image).all():
+            covered = 100 * np.isfinite(image).mean()
+            raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{sets[0].model.name}' and cannot be "
+                             "put on its pixels: give vis, and the residuals are made there")
+        weighting = "briggs" if one.weighting in ("briggs", "uniform") else "natural"
+        if one.weighting not in ("briggs", "natural"):
+            known = f"weighting '{one.weighting}'" if one.weighting else "an unknown weighting"
+            notes.append(f"the residual of '{one.name}' has {known}; it stands under {weighting}")
+        beam = beams.setdefault(weighting, one.beam)
+        if not np.allclose(beam[:2], one.beam[:2], rtol=1e-2):
+            notes.append(f"'{one.name}' has a beam of its own, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; give vis to "
+                         "compare residuals of one beam")
+        residuals[one.name][weighting] = image
+    if not beams:
+        beam = next((one.beam for one in sets if one.beam), None)
+        if beam is None:
+            raise ValueError("models: none of them has a beam, in an .image, .residual or .psf beside it: give vis, or put "
+                             "a restored image there")
+        beams["natural"] = beam
+    return beams, residuals
+
+
+class _Observed:
+    """Visibilities, and what they see of a model: always with one operator and the same weights.
+
+    Attributes
+    ----------
+    plane : SkyPlane
+        The common grid.
+    beams : dict
+        Weighting → major, minor in arcsec and position angle in degrees, fitted to the PSF.
+    """
+
+    def __init__(self, selection, plane, request, notes):
+        longitude, latitude = (float(angle) for angle in plane.centre)
+        grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
+        data = read_visibilities(selection, grid.phasecenter)
+        notes.extend(data.notes)
+        image_plane = define_image_plane(data, selection, grid)
+        self.plane, self._data, self._nthreads = SkyPlane(image_plane.csys, plane.shape), data, request.nthreads
+        self._operators = {}
+        operator = self._operator(self.plane, "models")
+        self._weights = {"natural": imaging_weights(data, grid, Weighting("natural")),
+                         "briggs": imaging_weights(data, grid, Weighting("briggs", request.robust))}
+        ones = np.ones(data.size, np.complex64)
+        self.beams = {weighting: beam_numbers(fit_beam(dirty_image(operator, ones, weights), image_plane))
+                      for weighting, weights in self._weights.items()}
+        self._block_of_sample, blocks = snapshot_blocks(data)
+        self._samples = np.array([block.samples for block in blocks])
+
+    def images(self, left):
+        """Return the residual images by weighting, in Jy/beam, of residual visibilities."""
+        operator = self._operator(self.plane, "models")
+        return {weighting: dirty_image(operator, left, weights).astype(float) for weighting, weights in self._weights.items()}
+
+    def chi_square(self, left):
+        """Return Σ w|r|² / 2N of each block of residual visibilities, 1 for noise as the weights say."""
+        power = self._data.weight * np.abs(left) ** 2
+        return np.bincount(self._block_of_sample, power, self._samples.size) / (2 * self._samples)
+
+    def minus(self, image, model):
+        """Return the data minus the visibilities of a model, given as it was made and on the common grid.
+
+        They are predicted from its own pixels where these have the common centre: regridding would blur it.
+        """
+        plane, pixels = (image.plane, image.pixels) if image.is_aligned(self.plane) else (self.plane, model)
+        operator = self._operator(plane, f"models: '{image.name}'")
+        return self._data.vis - operator.forward(np.asarray(pixels, np.float32))
+
+    def _operator(self, plane, what):
+        key = plane.shape, plane.cell_rad
+        if key not in self._operators:
+            try:
+                self._operators[key] = MeasurementOperator(self._data.uvw[:2], plane.cell_rad, plane.shape, eps=IMAGE_EPS,
+                                                           nthreads=self._nthreads)
+            except ValueError as error:
+                raise ValueError(f"{what}: its pixels cannot be held against vis: {error}") from error
+        return self._operators[key]

@@ -1,0 +1,82 @@
+"""The task saracompare: what the user asked for, checked and handed to the comparison."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import casa_sara
+from casa_sara import jsonfile
+from casa_sara.analysis.comparison import Comparison
+from casa_sara.casa import log
+from casa_sara.compare import compare_images
+from casa_sara.options import Comparing, Selection
+from casa_sara.private.task_tsara import selection_of
+from casa_sara.resources import available_cores
+from casa_sara.tasks.saracompare import PARAMETERS
+
+__all__ = ["saracompare"]
+
+MEASURES = "measures.json"
+OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust")  # what has no effect without vis
+
+
+def saracompare(**parameters: Any) -> dict[str, Any]:
+    """Run the task on validated parameters and return the measures."""
+    log.info(f"casa_sara {casa_sara.__version__}")
+    selection = _selection(parameters)
+    folder = _folder(parameters["outdir"], parameters["overwrite"])
+    models, names, regions = (_words(parameters[name]) for name in ("models", "names", "regions"))
+    request = Comparing(models, names, parameters["truth"], regions, parameters["support"], parameters["threshold"],
+                        parameters["robust"], available_cores())
+    comparison = compare_images(request, selection)
+    if folder:
+        folder.mkdir(exist_ok=True)
+        jsonfile.save(folder / MEASURES, comparison.measures)
+        _report(comparison, folder)
+    return comparison.measures
+
+
+def _selection(parameters):
+    """Return the selection of visibilities, None where there are none."""
+    if _words(parameters["vis"]):
+        return selection_of(parameters)
+    defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
+    for name in OF_VIS:
+        if parameters[name] != defaults[name]:
+            raise ValueError(f"{name} = {parameters[name]!r} has no effect without vis: give vis, or leave {name} at "
+                             f"{defaults[name]!r}")
+    return None
+
+
+def _folder(outdir, overwrite):
+    """Return the folder of the report, None where none is wanted; raise unless it can be written."""
+    if not outdir:
+        return None
+    folder = Path(outdir)
+    parent = folder.absolute().parent
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"outdir = '{outdir}' is a file: should be a folder, or the name of a new one")
+    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
+        raise FileExistsError(f"outdir = '{outdir}' holds files: choose another folder, or overwrite = True to replace an "
+                              "earlier report in it")
+    if not parent.is_dir():
+        raise FileNotFoundError(f"outdir = '{outdir}': the folder '{parent}' does not exist")
+    if not os.access(folder if folder.is_dir() else parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"outdir = '{outdir}' cannot be written to")
+    return folder
+
+
+def _words(value):
+    """Return one string or several as a tuple, without empty ones."""
+    return tuple(word for word in ([value] if isinstance(value, str) else value) if word)
+
+
+def _report(comparison: Comparison, folder: Path) -> None:
+    """Write the report and its pictures."""
+    try:  # merged later
+        from casa_sara.analysis.report import write_report
+    except ImportError:
+        return
+    write_report(comparison, folder)
