@@ -85,8 +85,11 @@ def _parse(body, text, parameter):
     elif "[[" not in body and "(" not in body:
         return [_circle(body, wrong)]
     style = "crtf" if body.startswith("#CRTF") or "[[" in body else "ds9"
-    if style == "crtf" and not body.startswith("#CRTF"):
-        body = f"#CRTFv0\n{body}" if "coord" in body else f"#CRTFv0\nglobal coord=J2000\n{body}"
+    if style == "crtf":
+        lines = [line for line in body.splitlines() if not line.startswith("#")]
+        if "coord" not in body and "pix" not in body:  # of the image, says CASA; the parser takes it for pixels
+            lines.insert(0, "global coord=J2000")
+        body = "\n".join(["#CRTFv0", *lines])
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a line that is not understood must not be left out
