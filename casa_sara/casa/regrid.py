@@ -10,6 +10,7 @@ from casa_sara.casa.imageplane import slabs
 __all__ = ["PixelMap", "corners", "interpolated", "on_plane"]
 
 _SAME_PIXEL = 1e-3  # pixels; two grids whose corners agree so well are one
+_SAME_SIZE = 1e-2  # pixels over a whole image, below which pixel sizes are the same
 
 
 class PixelMap:
@@ -80,7 +81,8 @@ def on_plane(pixels, place, shape):
     if pixels.shape == tuple(shape) and np.abs(moved - corners(pixels.shape)).max() < _SAME_PIXEL:
         return pixels
     size = [np.linalg.norm(moved[:, k] - moved[:, 0]) / max(n - 1, 1) for k, n in ((1, nx), (2, ny))]
-    parts = [max(1, int(np.ceil(2 * s))) for s in size]
+    # half a new pixel leaves no ripple; pixels of the same size are not cut, so that a shift by whole pixels is exact
+    parts = [1 if abs(s - 1) * max(shape) < _SAME_SIZE else max(1, int(np.ceil(2 * s - 1e-3))) for s in size]
     cuts = [(np.arange(k) + 0.5) / k - 0.5 for k in parts]
     model = np.zeros(shape, np.float64)
     for rows in slabs(nx, ny * parts[0] * parts[1]):
