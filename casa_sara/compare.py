@@ -14,7 +14,7 @@ from casa_sara.analysis.comparison import Comparison, Product
 from casa_sara.analysis.measuring import measure, source_support
 from casa_sara.casa import log
 from casa_sara.casa.imageplane import define_image_plane
-from casa_sara.casa.imagesets import check_same_data, read_image_set
+from casa_sara.casa.imagesets import check_same_data, data_names, read_image_set
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.skyimage import SkyPlane, beam_numbers, read_sky_image
@@ -74,6 +74,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     if observed:
         beams = observed.beams
         residuals, chi_square = {}, {}
+        notes.extend(_other_data(sets, selection))
         for one in sets:
             left = observed.minus(one.model, models[one.name])
             residuals[one.name], chi_square[one.name] = observed.images(left), observed.chi_square(left)
@@ -127,6 +128,17 @@ def _on_grid(image, plane, first, parameter, notes):
         if lost > LOST:
             notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies beyond '{first.name}'")
     return model
+
+
+def _other_data(sets, selection):
+    """Say which products were not made of just these visibilities."""
+    given = data_names(selection.vis)
+    for one in sets:
+        if one.data and one.data != given:
+            yield (f"'{one.name}' was made of {', '.join(sorted(one.data))}, and is held against {', '.join(sorted(given))} "
+                   "like the others")
+        if one.record.get("wild"):
+            yield f"{len(one.record['wild'])} wild samples that '{one.name}' left out are in the residuals of all"
 
 
 def _product(one, model, residuals, beams, cell_arcsec):

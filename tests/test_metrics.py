@@ -210,6 +210,19 @@ def test_regions_of_every_kind_cover_their_area(tmp_path):
     assert masks["b 2"].sum() == pytest.approx(5 * 4 / 0.25, rel=0.25)
 
 
+def test_regions_keep_their_shape_in_oblong_cells():
+    frame = Frame((299.87, 40.73), (0.5, 0.25), (64, 100))
+    masks = region_masks(["299.87deg 40.73deg 4arcsec", "fk5; box(299.87,40.73,5.9\",7.9\",0)"], frame)
+    x, y = (np.indices((64, 100)) - np.array([32, 50])[:, None, None]) * np.array([0.5, 0.25])[:, None, None]
+    for mask, by_hand, edge in zip(masks.values(), (np.hypot(x, y) < 4, (abs(x) < 2.95) & (abs(y) < 3.95)),
+                                   (abs(np.hypot(x, y) - 4) < 0.01, np.zeros(x.shape, bool))):
+        assert not (mask ^ by_hand)[~edge].any() and mask.sum() > 300
+    for text in ("299.87deg 40.73deg 13arcsec", "299.8637deg 40.73deg 0.1arcsec"):  # 25 arcsec high, 32 wide: 17 to the west
+        with pytest.raises(ValueError, match="beyond the image|outside the image"):
+            region_masks([text], frame)
+    assert region_masks(["299.8650deg 40.73deg 1arcsec"], frame)  # 14 to the west
+
+
 @pytest.mark.parametrize("text, error, message", [
     ("299.87009deg 40.73deg 0.05arcsec", ValueError, "is empty: no pixel centre"),  # between pixels
     ("299.88deg 40.73deg 1arcsec", ValueError, "outside the image"),

@@ -145,7 +145,7 @@ def test_other_pixels_keep_the_flux(tmp_path, pixels, cell, factor):
 
 
 def test_another_centre_and_frame_is_the_same_sky(tmp_path):
-    """The same pixels of the sky around another centre, and the same image in Galactic coordinates."""
+    """The same pixels of the sky around another centre."""
     one, model, _ = product(tmp_path / "one")
     shifted = np.roll(sky(), (-6, 4), axis=(0, 1))
     centre = CENTRE[0] - 6 * 0.5 * ARCSEC / np.cos(CENTRE[1]), CENTRE[1] - 4 * 0.5 * ARCSEC
@@ -154,6 +154,20 @@ def test_another_centre_and_frame_is_the_same_sky(tmp_path):
     assert found["similarity"]["natural"]["one|two"] > 50
     same = saracompare(models=[one, write(tmp_path / "wrong.model", shifted)])["similarity"]["natural"]["one|wrong"]
     assert same < 5
+
+
+def test_a_point_in_galactic_coordinates_is_found_again(tmp_path):
+    me = casatools.measures()
+    offset = CENTRE[0] - 24 * 0.5 * ARCSEC / np.cos(CENTRE[1]), CENTRE[1] + 14 * 0.5 * ARCSEC
+    there = me.measure(me.direction("J2000", *(f"{float(angle)!r}rad" for angle in offset)), "GALACTIC")
+    point = sky(sources=[(1.0, 0, 0)])
+    one, *_ = product(tmp_path / "one", sky(sources=[(1.0, 24, 14)]))
+    two = write(tmp_path / "two.model", point, centre=[there[axis]["value"] for axis in ("m0", "m1")], frame="GALACTIC")
+    found = saracompare(models=[one, two])
+    assert found["products"]["two"]["flux_jy"] == pytest.approx(1.0, rel=1e-6)
+    assert found["similarity"]["natural"]["one|two"] > 35
+    with pytest.raises(ValueError, match="models: '.*two.model' is in GALACTIC: the first should be in J2000 or ICRS"):
+        saracompare(models=[two, one])
 
 
 def test_fits_is_read_like_casa(tmp_path):
@@ -379,7 +393,11 @@ def test_products_of_different_data_are_refused_without_vis(tmp_path, vis):
     two, *_ = product(tmp_path / "two", history=["vis = ['run/b.ms', 'c.ms']"])
     with pytest.raises(ValueError, match=r"'one' \(a.ms\) and 'two' \(b.ms, c.ms\) are made of different data"):
         saracompare(models=[one, two])
-    assert saracompare(models=[one, two], vis=vis, datacolumn="data")["similarity"]["natural"] == {"one|two": np.inf}
+    jsonfile.save(one + ".sara.json", {"wild": [{"row": 5}]})
+    comparison = compare_images(Comparing((one, two)), Selection((vis,), datacolumn="data"))
+    assert comparison.measures["similarity"]["natural"] == {"one|two": np.inf}
+    assert "'two' was made of b.ms, c.ms, and is held against c.ms like the others" in comparison.notes
+    assert "1 wild samples that 'one' left out are in the residuals of all" in comparison.notes
     three, *_ = product(tmp_path / "three", history=["vis = ['other/a.ms']"])
     assert saracompare(models=[one, three])["similarity"]["natural"] == {"one|three": np.inf}
 

@@ -31,13 +31,26 @@ class Frame:
     @property
     def wcs(self) -> WCS:
         """The astropy WCS; x runs to the west."""
+        return self._wcs(self.cell_arcsec[0])
+
+    @property
+    def square_wcs(self) -> WCS:
+        """The same with pixels that are as wide as they are high: regions keep their shape only on these."""
+        return self._wcs(self.cell_arcsec[1])
+
+    def square_x(self, x):
+        """Return pixel coordinates x on the square pixels."""
+        middle = self.shape[0] // 2
+        return (x - middle) * self.cell_arcsec[0] / self.cell_arcsec[1] + middle
+
+    def _wcs(self, width):
         wcs = WCS(naxis=2)
         wcs.wcs.ctype = ["RA---SIN", "DEC--SIN"]
         wcs.wcs.radesys = self.radesys
         wcs.wcs.equinox = 2000.0
         wcs.wcs.crval = self.centre_deg
         wcs.wcs.crpix = [n // 2 + 1 for n in self.shape]
-        wcs.wcs.cdelt = [-self.cell_arcsec[0] / 3600, self.cell_arcsec[1] / 3600]
+        wcs.wcs.cdelt = [-width / 3600, self.cell_arcsec[1] / 3600]
         return wcs
 
 
@@ -129,24 +142,25 @@ def _mask(region, frame, given):
         warnings.simplefilter("ignore")
         pixel = _on_pixels(region, frame)
     box = pixel.bounding_box if np.isfinite(_centre(pixel)).all() else None
-    nx, ny = frame.shape
-    if box is None or box.ixmin >= nx or box.iymin >= ny or box.ixmax <= 0 or box.iymax <= 0:
+    left, right = (frame.square_x(edge - 0.5) + 0.5 for edge in (0, frame.shape[0]))
+    top = frame.shape[1]
+    if box is None or box.ixmin >= right or box.iymin >= top or box.ixmax <= left or box.iymax <= 0:
         raise ValueError(f"{given} is outside the image, which is centred on {_spell(frame)}")
-    if box.ixmin < 0 or box.iymin < 0 or box.ixmax > nx or box.iymax > ny:
+    if box.ixmin < left or box.iymin < 0 or box.ixmax > right or box.iymax > top:
         raise ValueError(f"{given} reaches beyond the image, which is centred on {_spell(frame)}: should be inside")
     x, y = np.indices(frame.shape)
-    mask = np.asarray(pixel.contains(PixCoord(x, y)), bool)
+    mask = np.asarray(pixel.contains(PixCoord(frame.square_x(x), y)), bool)
     if not mask.any():
         raise ValueError(f"{given} is empty: no pixel centre is inside, the pixels are {frame.cell_arcsec[0]:.3g} arcsec")
     return mask
 
 
 def _on_pixels(region, frame) -> PixelRegion:
-    """Return the region in pixels; a circle by its radius, as pixels are square."""
-    if isinstance(region, CircleSkyRegion) and np.isclose(*frame.cell_arcsec):
-        x, y = frame.wcs.world_to_pixel(region.center)
-        return CirclePixelRegion(PixCoord(float(x), float(y)), region.radius.to_value("arcsec") / frame.cell_arcsec[0])
-    return region.to_pixel(frame.wcs)
+    """Return the region in square pixels; a circle with its exact radius."""
+    if isinstance(region, CircleSkyRegion):
+        x, y = frame.square_wcs.world_to_pixel(region.center)
+        return CirclePixelRegion(PixCoord(float(x), float(y)), region.radius.to_value("arcsec") / frame.cell_arcsec[1])
+    return region.to_pixel(frame.square_wcs)
 
 
 def _centre(pixel):

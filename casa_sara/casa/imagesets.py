@@ -11,7 +11,7 @@ from casa_sara import jsonfile
 from casa_sara.casa.products import RECORD
 from casa_sara.casa.skyimage import SkyImage, read_header, read_sky_image
 
-__all__ = ["ImageSet", "check_same_data", "read_image_set"]
+__all__ = ["ImageSet", "check_same_data", "data_names", "read_image_set"]
 
 _SUFFIXES = ("", ".fits")
 _NAMES = (".model", ".model.fits", ".fits")
@@ -47,6 +47,11 @@ class ImageSet:
     def called(self, name):
         """Return the same with another name."""
         return replace(self, name=name)
+
+    @property
+    def data(self) -> set[str]:
+        """The MeasurementSets that the history names, without their folders; empty when it does not."""
+        return _data(self)
 
     @property
     def weighting(self) -> str:
@@ -91,7 +96,7 @@ def read_image_set(given, name="", with_residual=True):
 
 def check_same_data(sets):
     """Raise ValueError when the histories of the products name different MeasurementSets."""
-    first, *others = [(one, _data(one)) for one in sets if _data(one)] or [(None, None)]
+    first, *others = [(one, one.data) for one in sets if one.data] or [(None, None)]
     for other, data in others:
         if data != first[1]:
             pair = [f"'{one.name}' ({', '.join(sorted(names))})" for one, names in (first, (other, data))]
@@ -128,5 +133,9 @@ def _data(one):
         value = ast.literal_eval(text)
     except (SyntaxError, ValueError):
         value = text
-    names = value if isinstance(value, (list, tuple)) else [value]
-    return {os.path.basename(str(name).rstrip("/")) for name in names if str(name)}
+    return data_names(value if isinstance(value, (list, tuple)) else [value])
+
+
+def data_names(vis):
+    """Return MeasurementSets by their names without folders, to tell whether they are the same."""
+    return {os.path.basename(str(name).rstrip("/")) for name in vis if str(name)}

@@ -11,7 +11,7 @@ import time
 
 __all__ = ["Progress", "error", "info", "warn"]
 
-ORIGIN = "tsara"
+ORIGIN = "casa_sara"
 
 
 def _sink():
