@@ -67,8 +67,9 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     if request.truth:
         image = read_sky_image(request.truth, "truth", ("Jy/pixel",))
         truth = _on_grid(image, plane, first, "truth", notes)
-    frame = Frame(tuple(float(x) for x in np.degrees(plane.centre)), tuple(c / ARCSEC for c in plane.cell_rad), plane.shape,
-                  RADESYS[plane.frame])
+    centre_deg = tuple(np.degrees(plane.centre).tolist())
+    cell_arcsec = tuple((np.array(plane.cell_rad) / ARCSEC).tolist())
+    frame = Frame(centre_deg, cell_arcsec, plane.shape, RADESYS[plane.frame])
     regions = region_masks(request.regions, frame)
     # one operator
     if observed:
@@ -98,14 +99,15 @@ def _read(request, with_residual, fewest):
     if len(models) < fewest:
         raise ValueError(f"models = {list(models)}: should be {fewest} or more products to compare")
     if names and len(names) != len(models):
-        raise ValueError(f"names = {list(names)}: {len(names)} for {len(models)} models; should be one for each, or none")
+        raise ValueError(f"names = {list(names)}: {len(names)} for {len(models)} models; should be one each, or none")
     if len(set(names)) < len(names) or any("|" in name or not name.strip() for name in names):
         raise ValueError(f"names = {list(names)}: should differ, not be empty, and hold no '|'")
     sets = [read_image_set(given, name, with_residual) for given, name in zip(models, names or [""] * len(models))]
     taken = set()
     for number, one in enumerate(sets):
         name = one.name.replace("|", "_")
-        tries = [name, os.path.normpath(models[number]).replace("|", "_")] + [f"{name} {n}" for n in range(2, len(sets) + 2)]
+        tries = [name, os.path.normpath(models[number]).replace("|", "_")]
+        tries += [f"{name} {n}" for n in range(2, len(sets) + 2)]
         sets[number] = one.called(next(word for word in tries if word not in taken))
         taken.add(sets[number].name)
     return sets
@@ -114,15 +116,15 @@ def _read(request, with_residual, fewest):
 def _on_grid(image, plane, first, parameter, notes):
     """Return a model on the common grid, and say what became of it."""
     if not image.overlaps(plane):
-        raise ValueError(f"{parameter}: '{image.name}' does not overlap '{first.name}' on the sky: should be images of one "
-                         "field")
+        raise ValueError(f"{parameter}: '{image.name}' does not overlap '{first.name}' on the sky: should be images of "
+                         "one field")
     if not image.pixels.any():
         raise ValueError(f"{parameter}: '{image.name}' is zero everywhere: should be a model with emission")
     model = image.flux_on(plane)
     total = float(np.abs(image.pixels).sum(dtype=float))
     lost = 1 - float(np.abs(model).sum()) / total
     if not model.any():
-        raise ValueError(f"{parameter}: '{image.name}' has no flux within '{first.name}': should be images of one field")
+        raise ValueError(f"{parameter}: '{image.name}' has no flux within '{first.name}': should show the same sky")
     if model.shape != image.pixels.shape or not np.array_equal(model, image.pixels):
         notes.append(f"'{image.name}' was put on the pixels of '{first.name}', its flux kept")
         if lost > LOST:
@@ -135,8 +137,8 @@ def _other_data(sets, selection):
     given = data_names(selection.vis)
     for one in sets:
         if one.data and one.data != given:
-            yield (f"'{one.name}' was made of {', '.join(sorted(one.data))}, and is held against {', '.join(sorted(given))} "
-                   "like the others")
+            theirs, ours = (", ".join(sorted(names)) for names in (one.data, given))
+            yield f"'{one.name}' was made of {theirs}, and is held against {ours} like the others"
         if one.record.get("wild"):
             yield f"{len(one.record['wild'])} wild samples that '{one.name}' left out are in the residuals of all"
 
@@ -158,7 +160,9 @@ def _support(request, plane, frame, models, truth, beam, notes):
         return source_support(models, truth, request.threshold, beam, frame.cell_arcsec)
     if os.path.isdir(text) or text.endswith((".fits", ".mask")):
         image = read_sky_image(text, "support", None)
-        support = np.nan_to_num(image.brightness_on(plane)) > 0.5 if image.overlaps(plane) else np.zeros(plane.shape, bool)
+        support = np.zeros(plane.shape, bool)
+        if image.overlaps(plane):
+            support = np.nan_to_num(image.brightness_on(plane)) > 0.5
     else:
         support = np.any(list(region_masks([text], frame, "support").values()), axis=0)
     if support.all() or not support.any():
@@ -166,7 +170,7 @@ def _support(request, plane, frame, models, truth, beam, notes):
                          "part of it, above 0.5 in a mask image")
     outside = max(model[~support].max() / model.max() for model in models)
     if outside > 0.5:
-        notes.append(f"support = '{text}' leaves out pixels of {100 * outside:.2g} % of a model's peak: is it the source?")
+        notes.append(f"support = '{text}' leaves out a pixel of {100 * outside:.2g} % of a model's peak: is that right?")
     return support
 
 
@@ -178,27 +182,27 @@ def _beside(sets, plane, notes):
             notes.append(f"'{one.name}' has no residual image: give vis to have one made")
             continue
         if one.beam is None:
-            raise ValueError(f"models: '{one.residual.name}' has no beam, nor has an image or PSF beside it: give vis, or "
-                             "put the restored image there")
+            raise ValueError(f"models: '{one.residual.name}' has no beam, nor has an image or PSF beside it: give vis, "
+                             "or put the restored image there")
         image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
         if not np.isfinite(image).all():
             covered = 100 * np.isfinite(image).mean()
-            raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{sets[0].model.name}' and cannot be "
-                             "put on its pixels: give vis, and the residuals are made there")
+            raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{sets[0].model.name}' and cannot "
+                             "be put on its pixels: give vis, and the residuals are made there")
         weighting = "briggs" if one.weighting in ("briggs", "uniform") else "natural"
         if one.weighting not in ("briggs", "natural"):
             known = f"weighting '{one.weighting}'" if one.weighting else "an unknown weighting"
             notes.append(f"the residual of '{one.name}' has {known}; it stands under {weighting}")
         beam = beams.setdefault(weighting, one.beam)
         if not np.allclose(beam[:2], one.beam[:2], rtol=1e-2):
-            notes.append(f"'{one.name}' has a beam of its own, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; give vis to "
-                         "compare residuals of one beam")
+            notes.append(f"'{one.name}' has a beam of its own, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; give vis "
+                         "to compare residuals of one beam")
         residuals[one.name][weighting] = image
     if not beams:
         beam = next((one.beam for one in sets if one.beam), None)
         if beam is None:
-            raise ValueError("models: none of them has a beam, in an .image, .residual or .psf beside it: give vis, or put "
-                             "a restored image there")
+            raise ValueError("models: none of them has a beam, in an .image, .residual or .psf beside it: give vis, or "
+                             "put a restored image there")
         beams["natural"] = beam
     return beams, residuals
 
@@ -234,7 +238,8 @@ class _Observed:
     def images(self, left):
         """Return the residual images by weighting, in Jy/beam, of residual visibilities."""
         operator = self._operator(self.plane, "models")
-        return {weighting: dirty_image(operator, left, weights).astype(float) for weighting, weights in self._weights.items()}
+        return {weighting: dirty_image(operator, left, weights).astype(float)
+                for weighting, weights in self._weights.items()}
 
     def chi_square(self, left):
         """Return Σ w|r|² / 2N of each block of residual visibilities, 1 for noise as the weights say."""
@@ -254,8 +259,8 @@ class _Observed:
         key = plane.shape, plane.cell_rad
         if key not in self._operators:
             try:
-                self._operators[key] = MeasurementOperator(self._data.uvw[:2], plane.cell_rad, plane.shape, eps=IMAGE_EPS,
-                                                           nthreads=self._nthreads)
+                self._operators[key] = MeasurementOperator(self._data.uvw[:2], plane.cell_rad, plane.shape,
+                                                           eps=IMAGE_EPS, nthreads=self._nthreads)
             except ValueError as error:
                 raise ValueError(f"{what}: its pixels cannot be held against vis: {error}") from error
         return self._operators[key]

@@ -172,9 +172,9 @@ def test_residual_statistics_by_hand():
     assert found["sigma"] == pytest.approx(sigma) and found["max_abs"] == 5.0
     assert found["skewness"] == pytest.approx((27 - 3) / 4 / sigma**3)
     assert found["kurtosis"] == pytest.approx((81 + 3) / 4 / 9 - 3)
-    for bad, message in ((np.full((4, 4), 2.0), "all pixels are 2"), (np.full((4, 4), np.nan), "16 pixels are not finite")):
+    for value, message in ((2.0, "all pixels are 2"), (np.nan, "16 pixels are not finite")):
         with pytest.raises(ValueError, match=message):
-            residual_statistics(bad)
+            residual_statistics(np.full((4, 4), value))
 
 
 def test_power_spectrum_of_noise_and_of_a_wave():
@@ -196,11 +196,14 @@ FRAME = Frame((299.87, 40.73), (0.5, 0.5), (64, 50))
 def test_regions_of_every_kind_cover_their_area(tmp_path):
     """Circle, CRTF and DS9 name the same pixels; a circle 3 arcsec to the east of the centre, radius 4 arcsec."""
     east = 299.87 + 3 / 3600 / np.cos(np.deg2rad(40.73))
-    (tmp_path / "a.crtf").write_text(f"#CRTFv0\ncircle[[{east}deg, 40.73deg], 4arcsec], coord=J2000, label='inner part'\n")
-    (tmp_path / "c.crtf").write_text(f"#CRTFv0\nellipse[[{east}deg, 40.73deg], [4arcsec, 4arcsec], 0deg]\n")  # of the image's frame
-    (tmp_path / "b.reg").write_text(f'# Region file format: DS9\nfk5\ncircle({east},40.73,4")\nbox({east},40.73,5",4",0)\n')
+    circle = f"circle[[{east}deg, 40.73deg], 4arcsec]"
+    (tmp_path / "a.crtf").write_text(f"#CRTFv0\n{circle}, coord=J2000, label='inner part'\n")
+    ellipse = f"ellipse[[{east}deg, 40.73deg], [4arcsec, 4arcsec], 0deg]"
+    (tmp_path / "c.crtf").write_text(f"#CRTFv0\n{ellipse}\n")  # in the frame of the image
+    ds9 = f'circle({east},40.73,4")\nbox({east},40.73,5",4",0)'
+    (tmp_path / "b.reg").write_text(f"# Region file format: DS9\nfk5\n{ds9}\n")
     masks = region_masks([f"lobe = {east}deg 40.73deg 4arcsec", "a.crtf", "b.reg",
-                          f"circle[[{east}deg, 40.73deg], 4arcsec]", "c.crtf"], FRAME)
+                          circle, "c.crtf"], FRAME)
     assert list(masks)[:4] == ["lobe", "inner part", "b", "b 2"] and list(masks)[5] == "c"
     x, y = np.indices((64, 50))
     by_hand = np.hypot(x - (32 - 6), y - 25) < 8 + 1e-3
@@ -217,10 +220,16 @@ def test_regions_keep_their_shape_in_oblong_cells():
     for mask, by_hand, edge in zip(masks.values(), (np.hypot(x, y) < 4, (abs(x) < 2.95) & (abs(y) < 3.95)),
                                    (abs(np.hypot(x, y) - 4) < 0.01, np.zeros(x.shape, bool))):
         assert not (mask ^ by_hand)[~edge].any() and mask.sum() > 300
-    for text in ("299.87deg 40.73deg 13arcsec", "299.8637deg 40.73deg 0.1arcsec"):  # 25 arcsec high, 32 wide: 17 to the west
+    for text in ("299.87deg 40.73deg 13arcsec", "299.8637deg 40.73deg 0.1arcsec"):  # 25 arcsec high; 17 of 16 to the west
         with pytest.raises(ValueError, match="beyond the image|outside the image"):
             region_masks([text], frame)
     assert region_masks(["299.8650deg 40.73deg 1arcsec"], frame)  # 14 to the west
+
+
+def test_a_file_with_a_line_that_is_not_understood_is_refused(tmp_path):
+    (tmp_path / "half.reg").write_text('# Region file format: DS9\nfk5\ncircle(299.87,40.73,4")\nblob(299.87,40.73,4")\n')
+    with pytest.raises(ValueError, match="regions = 'half.reg' is not a region.*blob"):
+        region_masks(["half.reg"], FRAME)
 
 
 @pytest.mark.parametrize("text, error, message", [
@@ -252,7 +261,8 @@ def test_measures_on_plain_arrays():
     beams = {"natural": (3.0, 2.0, 10.0)}
     products = []
     for name, error in (("one", 1e-3), ("two", 1e-2)):
-        model, residual = truth + error * np.abs(rng.standard_normal(truth.shape)), error * rng.standard_normal(truth.shape)
+        noise = error * rng.standard_normal((2, *truth.shape))
+        model, residual = truth + np.abs(noise[0]), noise[1]
         products.append(Product(name, model, {"natural": residual}, {"natural": 20 * model + residual}))
     support = source_support([p.model for p in products], truth, 1e-2, beams["natural"], (0.5, 0.5))
     mask = np.zeros((64, 64), bool)
@@ -263,7 +273,8 @@ def test_measures_on_plain_arrays():
     assert one["mdr"] == pytest.approx(products[0].model.max() / products[0].model[~support].max())
     area = np.pi * 3 * 2 / (4 * np.log(2) * 0.25)
     assert one["regions"]["lobe"]["flux_jy"] == pytest.approx(products[0].restored["natural"][mask].sum() / area)
-    assert one["regions"]["lobe"]["error_jy"] == pytest.approx(products[0].residual["natural"].std() * np.sqrt(100 / area))
+    error = products[0].residual["natural"].std() * np.sqrt(100 / area)
+    assert one["regions"]["lobe"]["error_jy"] == pytest.approx(error)
     assert one["regions"]["lobe"]["model_flux_jy"] == pytest.approx(products[0].model[mask].sum())
     assert one["natural"]["dr"] == pytest.approx(products[0].restored["natural"].max() / one["natural"]["sigma"])
     assert one["natural"]["chi_square"] == [1.5, 2.0] and "chi_square" not in two["natural"]

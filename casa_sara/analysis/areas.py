@@ -18,7 +18,7 @@ RIGHT = "a circle as '19h59m28.3s +40d44m02s 1.5arcsec', or a CRTF or DS9 file o
 
 @dataclass(frozen=True)
 class Frame:
-    """Where an image is: `centre_deg` (ICRS or J2000) of pixel (nx//2, ny//2), `cell_arcsec` (x, y), `shape`; SIN projection.
+    """Where an image is, in SIN projection: `centre_deg` of pixel (nx//2, ny//2), `cell_arcsec` (x, y) and `shape`.
 
     `radesys` is FITS's word for the frame: 'FK5' is CASA's J2000.
     """
@@ -113,10 +113,10 @@ def _parse(body, text, parameter):
         raise ValueError(f"{wrong}; it holds none")
     for region in found:
         if not isinstance(region, SkyRegion):
-            raise ValueError(f"{parameter} = '{text}' is in pixels, of an unknown image: should be in right ascension and "
-                             "declination")
+            raise ValueError(f"{parameter} = '{text}' is in pixels, of an unknown image: should be in right ascension "
+                             "and declination")
         if not region.meta.get("include", True):
-            raise ValueError(f"{parameter} = '{text}' excludes a part of the sky: should only hold regions to measure in")
+            raise ValueError(f"{parameter} = '{text}' excludes a part of the sky: should hold regions to measure in")
     return found
 
 
@@ -151,7 +151,8 @@ def _mask(region, frame, given):
     x, y = np.indices(frame.shape)
     mask = np.asarray(pixel.contains(PixCoord(frame.square_x(x), y)), bool)
     if not mask.any():
-        raise ValueError(f"{given} is empty: no pixel centre is inside, the pixels are {frame.cell_arcsec[0]:.3g} arcsec")
+        cell = " x ".join(f"{size:.3g}" for size in frame.cell_arcsec)
+        raise ValueError(f"{given} is empty: no pixel centre is inside, pixels are {cell} arcsec")
     return mask
 
 

@@ -35,7 +35,8 @@ def source_support(models, truth, threshold, beam, cell_arcsec) -> np.ndarray:
     bool (nx, ny)
         Where the smoothed truth, or the median of the smoothed models, exceeds the threshold.
     """
-    smoothed = [metrics.smooth(image, beam[:2], beam[2], cell_arcsec) for image in (models if truth is None else [truth])]
+    images = models if truth is None else [truth]
+    smoothed = [metrics.smooth(image, beam[:2], beam[2], cell_arcsec) for image in images]
     middle = np.median(smoothed, axis=0)
     return middle > threshold * middle.max()
 
@@ -121,7 +122,8 @@ def _against_truth(product, truth, cell_arcsec, beams):
         "snr": metrics.snr(truth, product.model),
         "log_snr": metrics.log_snr(truth, product.model),
         "snr_at_scale": {
-            f"{scale * beam:.3g}": metrics.snr_at_scale(truth, product.model, scale * beam, cell_arcsec) for scale in SCALES
+            f"{scale:.3g}": metrics.snr_at_scale(truth, product.model, scale, cell_arcsec)
+            for scale in beam * np.array(SCALES)
         },
     }
     if min(truth.shape) > 11:

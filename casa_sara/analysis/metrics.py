@@ -9,8 +9,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 __all__ = [
-    "beam_pixels", "dynamic_range", "integrated_flux", "isolated_point", "log_snr", "model_dynamic_range", "point_width",
-    "similarity", "smooth", "snr", "snr_at_scale", "ssim",
+    "beam_pixels", "dynamic_range", "integrated_flux", "isolated_point", "log_snr", "model_dynamic_range",
+    "point_width", "similarity", "smooth", "snr", "snr_at_scale", "ssim",
 ]
 
 FWHM_PER_SIGMA = np.sqrt(8 * np.log(2))
@@ -231,8 +231,8 @@ def point_width(model, pixel, half_side, cell=(1.0, 1.0)) -> float | None:
     -------
     float, or None where the square is empty
     """
-    low = [max(centre - half_side, 0) for centre in pixel]
-    part = np.clip(np.asarray(model, float)[low[0] : pixel[0] + half_side + 1, low[1] : pixel[1] + half_side + 1], 0, None)
+    square = tuple(slice(max(centre - half_side, 0), centre + half_side + 1) for centre in pixel)
+    part = np.clip(np.asarray(model, float)[square], 0, None)
     flux = part.sum()
     if not flux > 0:
         return None

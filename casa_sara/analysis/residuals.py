@@ -76,7 +76,7 @@ def radial_power_spectrum(image, cell=(1.0, 1.0), bins=None) -> tuple[np.ndarray
 
 
 def whiteness(image) -> float:
-    """Return geometric over arithmetic mean of the radial power spectrum: 1 when all scales are alike, towards 0 when not.
+    """Return geometric over arithmetic mean of the radial power spectrum: 1 when all scales are alike, else less.
 
     A residual image of pure noise is as white as the sampling of the uv plane lets it be, so this compares
     residuals of one operator and weighting.

@@ -59,8 +59,8 @@ def _folder(outdir, overwrite):
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"outdir = '{outdir}' is a file: should be a folder, or the name of a new one")
     if folder.is_dir() and any(folder.iterdir()) and not overwrite:
-        raise FileExistsError(f"outdir = '{outdir}' holds files: choose another folder, or overwrite = True to replace an "
-                              "earlier report in it")
+        raise FileExistsError(f"outdir = '{outdir}' holds files: choose another folder, or overwrite = True to replace "
+                              "an earlier report in it")
     if not parent.is_dir():
         raise FileNotFoundError(f"outdir = '{outdir}': the folder '{parent}' does not exist")
     if not os.access(folder if folder.is_dir() else parent, os.W_OK | os.X_OK):
