@@ -318,12 +318,29 @@ def test_models_on_finer_pixels_are_not_blurred(tmp_path, vis, scale):
     assert found["three"]["natural"]["sigma"] == pytest.approx(image[first::scale, first::scale].std(), rel=1e-3)
 
 
+def test_the_frame_of_the_first_model_is_kept(tmp_path, vis):
+    me = casatools.measures()
+    there = me.measure(me.direction("J2000", *(f"{float(angle)!r}rad" for angle in CENTRE)), "ICRS")
+    centre = [there[axis]["value"] for axis in ("m0", "m1")]
+    one, *_ = product(tmp_path / "one")
+    two, *_ = product(tmp_path / "two", frame="ICRS", centre=centre)
+    region = ["patch = 19h59m28.5s +40d44m02s 3.3arcsec"]
+    first = saracompare(models=[one, two], vis=vis, datacolumn="data", regions=region)["products"]
+    second = saracompare(models=[two, one], vis=vis, datacolumn="data", regions=region)["products"]
+    for name in ("one", "two"):
+        assert first[name]["natural"]["chi_square"] == pytest.approx([1.0, 1.0], abs=0.05)
+        assert second[name]["natural"]["sigma"] == pytest.approx(first["one"]["natural"]["sigma"], rel=1e-2)
+        assert second[name]["regions"]["patch"]["model_flux_jy"] == pytest.approx(81 * 0.02, rel=1e-2)
+
+
 def test_visibilities_are_selected_and_untouched(tmp_path, vis):
     one, *_ = product(tmp_path / "one")
+    before = {path: path.read_bytes() for path in Path(vis).rglob("*") if path.is_file()}
     both = saracompare(models=[one, one], vis=vis, datacolumn="data")["products"]["one"]["natural"]
     first = saracompare(models=[one, one], vis=[vis], scan="1", datacolumn="data")["products"]["one"]["natural"]
     assert len(both["chi_square"]) == 2 and len(first["chi_square"]) == 1 and first["sigma"] > both["sigma"]
     assert first["chi_square"][0] == pytest.approx(both["chi_square"][0], rel=1e-6)
+    assert before == {path: path.read_bytes() for path in Path(vis).rglob("*") if path.is_file()}
 
 
 # Refusals ---------------------------------------------------------------------------------------
