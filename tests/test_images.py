@@ -443,7 +443,7 @@ def test_messages_go_to_the_log(monkeypatch):
     log.info("one")
     log.warn("two")
     log.error("three")
-    assert posted == [("one", "INFO", "tsara"), ("two", "WARN", "tsara"), ("three", "SEVERE", "tsara")]
+    assert posted == [("one", "INFO", "casa_sara"), ("two", "WARN", "casa_sara"), ("three", "SEVERE", "casa_sara")]
 
 
 @pytest.mark.parametrize("live", [False, True])
