@@ -1,0 +1,140 @@
+"""Spectra and histograms: how far an image resolves, and whether its residuals look like noise."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.signal.windows import tukey
+
+from casa_sara.analysis.sheets import DPI, LINES, plain
+
+__all__ = ["histograms", "new_figure", "radial_spectrum", "spectra"]
+
+ARCSEC = np.pi / 180 / 3600
+TEXT, SMALL = {"fontsize": 10.5}, 9.5
+REACH = 8.0  # of a histogram, in standard deviations
+
+
+def new_figure(rows: int, columns: int, height: float, **options):
+    """Return a figure 11.5 inches wide and its axes, an array (rows, columns); `height` inches for each row."""
+    figure = Figure(figsize=(11.5, rows * height), dpi=DPI, facecolor="white", layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    for panel in axes.flat:
+        panel.tick_params(labelsize=SMALL)
+        panel.grid(True, color="0.9", lw=0.6)
+        panel.set_axisbelow(True)
+        panel.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def radial_spectrum(image, cell_arcsec, window: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """Return the power of an image averaged over rings of the Fourier plane.
+
+    Parameters
+    ----------
+    image : array_like (nx, ny)
+        Blank pixels count as zero.
+    cell_arcsec : (float, float)
+    window : bool
+        Taper the outer tenth, for images that do not fade out towards their edge. The power is that of the
+        image without the taper, if it looks the same all over.
+
+    Returns
+    -------
+    frequency : float64 (n,)
+        Middle of each ring in wavelengths.
+    power : float64 (n,)
+        Mean |Σ image e^(2πi…)|², in the square of the image's unit; of white noise σ² nx ny.
+    """
+    image = np.nan_to_num(np.asarray(image, float))
+    nx, ny = image.shape
+    if window:
+        taper = tukey(nx, 0.2)[:, None] * tukey(ny, 0.2)[None, :]
+        image = image * taper / np.sqrt(np.mean(taper**2))
+    u, v = np.fft.fftfreq(nx, cell_arcsec[0] * ARCSEC)[:, None], np.fft.rfftfreq(ny, cell_arcsec[1] * ARCSEC)[None, :]
+    radius = np.hypot(u, v)
+    power = np.abs(np.fft.rfft2(image)) ** 2
+    count = np.full(power.shape, 2.0)  # the half of the plane that rfft2 leaves out
+    count[:, [0] + ([-1] if ny % 2 == 0 else [])] = 1.0
+    width = 1.0 / (max(nx * cell_arcsec[0], ny * cell_arcsec[1]) * ARCSEC)
+    ring = np.rint(radius / width).astype(int)
+    ring[radius > 0.5 / (max(cell_arcsec) * ARCSEC)] = -1  # corners, which only some directions reach
+    inside = ring >= 0
+    weight = np.bincount(ring[inside], count[inside])
+    mean = np.bincount(ring[inside], (count * power)[inside]) / np.maximum(weight, 1)
+    filled = weight > 0
+    return np.flatnonzero(filled) * width, mean[filled]
+
+
+def spectra(path, comparison) -> None:
+    """Draw the amplitude of the models against spatial frequency, and the power of each kind of residuals."""
+    weightings = [w for w in ("natural", "briggs") if any(w in product.residual for product in comparison.products)]
+    figure, axes = new_figure(1, 1 + len(weightings), 4.2)
+    panels, cell = axes[0], comparison.cell_arcsec
+    images = [(product.name, product.model, LINES[number % 7], "-") for number, product in
+              enumerate(comparison.products)]
+    if comparison.truth is not None:
+        images.insert(0, ("truth", comparison.truth, "0.35", ":"))
+    lowest = np.inf
+    for name, image, colour, style in images:
+        frequency, power = radial_spectrum(image, cell)
+        panels[0].plot(frequency[1:] / 1e3, np.sqrt(power[1:]), style, color=colour, lw=1.6, label=plain(name))
+        lowest = min(lowest, *np.sqrt(power[1:]))
+    top = max(np.sqrt(radial_spectrum(image, cell)[1][0]) for _, image, _, _ in images)
+    panels[0].set(xscale="log", yscale="log", ylabel="mean amplitude [Jy]")
+    if top > 0:
+        panels[0].set_ylim(bottom=max(lowest, 1e-7 * top) / 1.5)
+    panels[0].set_title("models", **TEXT)
+    for panel, weighting in zip(panels[1:], weightings):
+        for number, product in enumerate(comparison.products):
+            if weighting in product.residual:
+                residual = product.residual[weighting]
+                frequency, power = radial_spectrum(residual, cell, window=True)
+                power /= np.nanvar(residual) * residual.size or 1
+                shown = power > 0
+                panel.plot(frequency[shown][1:] / 1e3, power[shown][1:], color=LINES[number % 7], lw=1.4,
+                           label=plain(product.name))
+        panel.axhline(1, color="0.3", ls="--", lw=1)
+        panel.set(xscale="log", yscale="log", ylabel="power over that of white noise")
+        bottom = panel.get_ylim()[0]
+        panel.set_ylim(bottom=max(bottom, 1e-5))
+        panel.set_title(f"residuals, {weighting}", **TEXT)
+    for panel in panels:
+        for weighting, beam in comparison.beams.items():
+            edge = 1 / (np.sqrt(beam[0] * beam[1]) * ARCSEC) / 1e3
+            panel.axvline(edge, color="0.6", lw=1, ls="-." if weighting == "natural" else "-")
+        panel.set_xlabel("spatial frequency [kλ]", **TEXT)
+        panel.yaxis.label.set_size(10.5)
+        panel.legend(fontsize=SMALL, frameon=False, loc="lower left")
+    figure.savefig(path)
+
+
+def histograms(path, comparison) -> bool:
+    """Draw the histograms of the residuals against the Gaussian; tell whether there are residuals."""
+    weightings = [w for w in ("natural", "briggs") if any(w in product.residual for product in comparison.products)]
+    if not weightings:
+        return False
+    figure, axes = new_figure(1, len(weightings), 4.0, sharey=True)
+    edges = np.linspace(-REACH, REACH, 81)
+    middle, width = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]
+    for panel, weighting in zip(axes[0], weightings):
+        smallest = np.inf
+        for number, product in enumerate(comparison.products):
+            residual = product.residual.get(weighting)
+            values = residual[np.isfinite(residual)] if residual is not None else np.zeros(0)
+            if not values.std() > 0:
+                continue
+            scaled = (values - values.mean()) / values.std()
+            counts = np.histogram(np.clip(scaled, -REACH, REACH), edges)[0] / (width * values.size)
+            smallest = min(smallest, 1 / (width * values.size))
+            label = f"{plain(product.name)}, extreme {np.abs(scaled).max():.1f} σ"
+            panel.stairs(np.where(counts > 0, counts, np.nan), edges, color=LINES[number % 7], lw=1.6, label=label)
+        panel.plot(middle, np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi), color="0.25", ls="--", lw=1.2,
+                   label="Gaussian")
+        panel.set(yscale="log", xlim=(-REACH, REACH), ylim=(min(smallest, 1e-3) / 2, 4))
+        panel.set_xlabel("residual / its standard deviation σ", **TEXT)
+        panel.set_title(f"residuals, {weighting}", **TEXT)
+        panel.legend(fontsize=SMALL, frameon=False, loc="upper left")
+    axes[0, 0].set_ylabel("density of pixels", **TEXT)
+    figure.savefig(path)
+    return True

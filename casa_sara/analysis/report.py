@@ -1,0 +1,165 @@
+"""The report on a comparison: one HTML file that holds everything, and its pictures as PNG files beside it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jinja2
+import numpy as np
+from PIL import Image
+
+from casa_sara.analysis import animation, convergence, diagnostics, pages
+from casa_sara.analysis.comparison import Comparison
+from casa_sara.analysis.sheets import DPI
+from casa_sara.analysis.tables import tables
+
+__all__ = ["Picture", "write_report"]
+
+TEMPLATE = "report.html.j2"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture of the report: its file, the section it belongs to, title and caption."""
+
+    path: Path
+    section: str
+    title: str
+    caption: str
+
+    @property
+    def data(self) -> str:
+        """The file as a data URI."""
+        return "data:image/png;base64," + base64.b64encode(self.path.read_bytes()).decode("ascii")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height at which it is shown, in pixels of the page."""
+        with Image.open(self.path) as image:
+            return tuple(round(100 * pixels / DPI) for pixels in image.size)
+
+
+def write_report(comparison: Comparison, folder: Path, title: str = "SARA imaging report",
+                 frames: Sequence[tuple[str, np.ndarray, float]] = ()) -> Path:
+    """Write the pictures of a comparison and report.html, which holds them all.
+
+    Sections for which there is nothing are left out.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Of one product or more.
+    folder : Path
+        Made if it is not there; files of an earlier report are replaced.
+    title : str
+    frames : sequence of (str, ndarray, float), optional
+        Title, model in Jy/pixel and pixel size in arcsec of reconstructions with different pixels, to be animated.
+
+    Returns
+    -------
+    Path
+        Of report.html.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = [*_sky(comparison, folder, frames), *_residuals(comparison, folder), *_runs(comparison, folder)]
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
+    template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
+                                  lstrip_blocks=True).get_template(TEMPLATE)
+    page = folder / "report.html"
+    page.write_text(template.render(
+        title=title,
+        comparison=comparison,
+        shape=comparison.products[0].model.shape,
+        tables=tables(comparison),
+        pictures=pictures,
+        parameters=_parameters(comparison),
+        is_single=len(comparison.products) == 1,
+        has_residuals=any(product.residual for product in comparison.products),
+        negative=_negative(comparison),
+    ), encoding="utf-8")  # fmt: skip
+    return page
+
+
+def _sky(comparison, folder, frames) -> list[Picture]:
+    """Draw the pictures of the sky."""
+    stretch = "One logarithmic scale for all that is per arcsec²; residuals have a scale of their own."
+    boxes = " Boxes are enlarged below; ellipses are the CLEAN beam."
+    made = []
+    for weighting in list(comparison.beams) or [None]:
+        path = folder / (f"sky_{weighting}.png" if weighting else "sky.png")
+        pages.overview(path, comparison, weighting)
+        name = f"All products, {weighting} weighting" if weighting else "All products"
+        made.append(Picture(path, "sky", name, stretch + boxes))
+    path = folder / "zooms.png"
+    if pages.zoomed(path, comparison):
+        made.append(Picture(path, "sky", "Models, enlarged",
+                            "The scale is that of the pictures above; the ellipse is the finest CLEAN beam."))
+    path = folder / "differences.png"
+    if pages.differences(path, comparison):
+        what = "the first product" if comparison.truth is None else "the truth"
+        made.append(Picture(path, "sky", "Differences", f"Models minus that of {what}, as they are and smoothed with "
+                            "each CLEAN beam. Red: more than there; blue: less. The scales are linear and end at the "
+                            "99.8th percentile."))
+    if frames:
+        path = folder / "cells.png"
+        animation.animate(path, frames)
+        made.append(Picture(path, "sky", "From coarse to fine pixels", "One part of the sky, imaged with different "
+                            "pixel sizes, on one logarithmic scale."))
+    return made
+
+
+def _residuals(comparison, folder) -> list[Picture]:
+    """Draw the spectra and histograms."""
+    path = folder / "spectra.png"
+    diagnostics.spectra(path, comparison)
+    caption = (
+        "Averages over rings of the Fourier plane. Left: where a model falls below the truth, or below the others, it "
+        "resolves no further. Vertical lines: one over the width of the CLEAN beam (dash-dotted: natural)."
+    )
+    if any(product.residual for product in comparison.products):
+        caption += (
+            " Right: residuals that are noise follow the weights of the data; what one product has more than the "
+            "others was left unmodelled at that scale."
+        )
+    made = [Picture(path, "residuals", "Radial power spectra", caption)]
+    path = folder / "histograms.png"
+    if diagnostics.histograms(path, comparison):
+        made.append(Picture(path, "residuals", "Histograms of the residuals", "Noise follows the Gaussian. Wings: "
+                            "emission left unmodelled, or artefacts; pixels beyond the ends are in the last bin."))
+    return made
+
+
+def _runs(comparison, folder) -> list[Picture]:
+    """Draw what tsara recorded of each run."""
+    made = []
+    for index, product in enumerate(comparison.products, 1):
+        path = folder / f"convergence_{index}.png"
+        if convergence.convergence(path, product):
+            made.append(Picture(path, "runs", f"Convergence of {product.name}", "Numbered lines: re-weightings. The "
+                                "bound of each block is what its residual norm may be."))
+        path = folder / f"blocks_{index}.png"
+        if convergence.block_noise(path, product):
+            made.append(Picture(path, "runs", f"Calibration of {product.name}, block by block", "Open: thermal noise, "
+                                "measured in the data. Filled: the level that the image had to be allowed; what it has "
+                                "more are calibration errors (and whatever the model cannot represent). 1 (dotted): "
+                                "the weights are right. Names above: scans."))
+    return made
+
+
+def _parameters(comparison) -> list[tuple[str, bool, list[str]]]:
+    """Return rows (name, whether it differs among the products, a value for each product)."""
+    given = [product for product in comparison.products if product.parameters]
+    rows = []
+    for name in dict.fromkeys(name for product in given for name in product.parameters):
+        values = [str(product.parameters[name]) if name in product.parameters else "–" for product in given]
+        rows.append((name, len(set(values) - {"–"}) > 1, values))
+    return rows
+
+
+def _negative(comparison) -> list[str]:
+    """Return the names of the products whose models have negative pixels."""
+    return [product.name for product in comparison.products if np.nanmin(product.model) < 0]

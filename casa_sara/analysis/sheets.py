@@ -1,0 +1,162 @@
+"""Sheets of sky panels: rows and columns of images with right ascension, declination, beam and colour bars.
+
+A sheet is at most 11.5 inches wide and is meant to be shown at 100 pixels per inch, where its text has the size of a
+page's text.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from astropy.wcs import WCS
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse, Rectangle
+from matplotlib.transforms import Affine2D
+
+__all__ = ["BRIGHTNESS_MAP", "DIFFERENCE_MAP", "DPI", "LINES", "Sheet", "beam_area", "celestial", "draw", "draw_beam",
+           "outline", "plain", "prefix"]
+
+BRIGHTNESS_MAP, DIFFERENCE_MAP = "inferno", "RdBu_r"
+LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
+DPI = 150
+WIDEST, WIDEST_PANEL = 11.5, 5.0  # of a sheet and of a panel, in inches
+LEFT, RIGHT, TOP, GAP, HEADING, BAR = 0.9, 0.15, 0.3, 0.08, 0.3, 1.15  # BAR: labels and colour bars below the panels
+TEXT = {"fontsize": 9.5}
+
+
+def plain(text) -> str:
+    """Return a text that matplotlib prints as it is: names may hold dollar signs."""
+    return str(text).replace("$", r"\$")
+
+
+def prefix(value: float) -> tuple[float, str]:
+    """Return the factor and the prefix of the unit that bring a positive value to between 1 and 1000."""
+    for factor, sign in ((1.0, ""), (1e3, "m"), (1e6, "µ")):
+        if value * factor >= 1:
+            return factor, sign
+    return 1e9, "n"
+
+
+def beam_area(beam) -> float:
+    """Return the solid angle of a Gaussian beam (arcsec, arcsec, degrees) in arcsec²."""
+    return np.pi * beam[0] * beam[1] / (4 * np.log(2))
+
+
+def celestial(comparison) -> WCS:
+    """Return the coordinates of the grid of a comparison (SIN projection, ICRS)."""
+    nx, ny = comparison.products[0].model.shape
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---SIN", "DEC--SIN"]
+    wcs.wcs.crval = comparison.centre_deg
+    wcs.wcs.crpix = [nx // 2 + 1, ny // 2 + 1]
+    wcs.wcs.cdelt = [-comparison.cell_arcsec[0] / 3600, comparison.cell_arcsec[1] / 3600]
+    return wcs
+
+
+@dataclass
+class Sheet:
+    """Rows and columns of panels with room for headings and colour bars.
+
+    Parameters
+    ----------
+    rows : sequence of str
+        Heading of each row.
+    columns : sequence of str
+        Heading of each column.
+    aspect : float
+        Height over width of a panel.
+    wcs : astropy.wcs.WCS, optional
+        Coordinates of the panels; without them the panels have no labels.
+    """
+
+    rows: Sequence[str]
+    columns: Sequence[str]
+    aspect: float
+    wcs: WCS | None = None
+
+    def __post_init__(self):
+        count, left = len(self.columns), LEFT if self.wcs else RIGHT
+        self.side = min((WIDEST - left - RIGHT - GAP * (count - 1)) / count, WIDEST_PANEL, 9 / self.aspect)
+        self.step = self.side * self.aspect + HEADING
+        width = left + count * (self.side + GAP) - GAP + RIGHT
+        self.bottom = BAR if self.wcs else BAR - 0.4
+        self.size = max(width, 4.0), TOP + len(self.rows) * self.step + self.bottom
+        self.left = left + (self.size[0] - width) / 2
+        self.figure = Figure(figsize=self.size, dpi=DPI, facecolor="white")
+        for number, heading in enumerate(self.columns):
+            self._write(self.left + number * (self.side + GAP) + self.side / 2, 0.17, heading, ha="center")
+        for number, heading in enumerate(self.rows):
+            top = TOP + number * self.step + HEADING - 0.08
+            self._write(self.left, top, heading, ha="left", va="baseline", fontweight="bold")
+
+    def _write(self, x, y, text, **style):
+        style = {"va": "center", "fontsize": 10.5, **style}
+        self.figure.text(x / self.size[0], 1 - y / self.size[1], plain(text), **style)
+
+    def _axes(self, left, top, width, height, **options):
+        wide, high = self.size
+        return self.figure.add_axes([left / wide, 1 - (top + height) / high, width / wide, height / high], **options)
+
+    def panel(self, row: int, column: int):
+        """Return new axes; labelled along the left and lower edges of the sheet only."""
+        left, top = self.left + column * (self.side + GAP), TOP + row * self.step + HEADING
+        options = {"projection": self.wcs} if self.wcs else {}
+        axes = self._axes(left, top, self.side, self.side * self.aspect, **options)
+        if not self.wcs:
+            axes.set(xticks=[], yticks=[])
+            return axes
+        for axis, name, shown in zip(axes.coords, ("RA", "Dec"), (row == len(self.rows) - 1, column == 0)):
+            axis.set_auto_axislabel(False)
+            axis.set_ticklabel_visible(shown)
+            axis.set_ticklabel(size=8.5, exclude_overlapping=True)
+            axis.set_ticks(number=4 if self.side > 3 else 3)
+            axis.tick_params(direction="in", color="0.7")
+            if shown:
+                axis.set_axislabel(name, minpad=0.4 if name == "Dec" else 0.6, **TEXT)
+        return axes
+
+    def bar(self, first: int, last: int, norm, colours: str, unit: str) -> None:
+        """Draw a colour bar below the columns first … last."""
+        width = (last - first + 1) * (self.side + GAP) - GAP
+        inset = min(0.15, 0.05 * width)
+        left = self.left + first * (self.side + GAP) + inset
+        axes = self._axes(left, self.size[1] - 0.6, width - 2 * inset, 0.13)
+        bar = self.figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal")
+        bar.set_label(unit, **TEXT)
+        axes.tick_params(labelsize=8.5)
+        if not isinstance(norm, LogNorm):
+            axes.locator_params(axis="x", nbins=5)
+
+    def save(self, path) -> None:
+        """Write the sheet."""
+        self.figure.savefig(path)
+
+
+def draw(axes, image, norm: Normalize, cell, colours: str = BRIGHTNESS_MAP) -> None:
+    """Draw an image (nx, ny) in pixel coordinates, in the proportions of the sky; what cannot be drawn is grey."""
+    shown = np.ma.masked_invalid(np.asarray(image, float))
+    if isinstance(norm, LogNorm):
+        shown = np.ma.maximum(shown, norm.vmin)
+    drawn = axes.imshow(shown.T, origin="lower", norm=norm, cmap=colours, aspect=cell[1] / cell[0])
+    drawn.get_cmap().set_bad("0.6")
+
+
+def draw_beam(axes, beam, cell, colour: str = "white", right: bool = False) -> None:
+    """Draw a beam (arcsec, arcsec, degrees from north through east) into a lower corner of the axes."""
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    away = 0.55 * beam[0] + 0.025 * abs(x1 - x0) * cell[0]
+    x, y = (x1 - away / cell[0] if right else x0 + away / cell[0]), y0 + away / cell[1]
+    turned = Affine2D().rotate_deg(beam[2]).scale(1 / cell[0], 1 / cell[1]).translate(x, y)
+    ellipse = Ellipse((0, 0), beam[1], beam[0], fill=False, color=colour, lw=1.0)
+    ellipse.set_transform(turned + axes.transData)
+    axes.add_patch(ellipse)
+
+
+def outline(axes, box: tuple[int, int, int, int], colour: str = "0.8") -> None:
+    """Outline the pixels x0 … x1 − 1, y0 … y1 − 1, with the box as (x0, x1, y0, y1)."""
+    x0, x1, y0, y1 = box
+    axes.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, color=colour, lw=0.8))

@@ -1,0 +1,171 @@
+"""The measures of a comparison as tables, for a page or for a terminal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["Table", "as_text", "number", "tables"]
+
+NOTHING = "–"
+WEIGHTINGS = ("natural", "briggs")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of text: title, heads of the columns, their units, rows (the first cell names the row), explanation."""
+
+    title: str
+    heads: tuple[str, ...]
+    units: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    caption: str = ""
+
+
+def number(value, digits: int = 4) -> str:
+    """Return a number with some significant digits; a dash for what there is not, ∞ for infinity."""
+    if value is None or isinstance(value, float) and np.isnan(value):
+        return NOTHING
+    if not isinstance(value, (int, float, np.number)):
+        return str(value)
+    if np.isinf(value):
+        return "∞" if value > 0 else "−∞"
+    if value != 0 and not 1e-3 <= abs(value) < 1e7:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa}e{int(exponent)}".replace("-", "−")
+    decimals = max(digits - 1 - int(np.floor(np.log10(abs(value)))), 0) if value != 0 else 0
+    return f"{value:,.{decimals}f}".replace("-", "−")
+
+
+def tables(comparison) -> list[Table]:
+    """Return the tables for which there are measures.
+
+    Parameters
+    ----------
+    comparison : casa_sara.analysis.comparison.Comparison
+    """
+    measured = comparison.measures.get("products", {})
+    names = [product.name for product in comparison.products if product.name in measured]
+    measured = {name: measured[name] for name in names}
+    made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS), _regions(measured),
+            _truth(measured), _similarity(comparison.measures.get("similarity", {}))]
+    return [table for table in made if table is not None]
+
+
+def as_text(comparison) -> str:
+    """Return all tables of a comparison as text for a terminal."""
+    parts = [_layout(table) for table in tables(comparison)]
+    parts += [f"note: {note}" for note in comparison.notes]
+    return "\n\n".join(parts) + "\n" if parts else "nothing was measured\n"
+
+
+def _build(title, columns, measured, caption="") -> Table | None:
+    """Make a table of products from columns (key, head, unit), leaving out what no product has."""
+    columns = [column for column in columns if any(column[0] in entry for entry in measured.values())]
+    if not columns:
+        return None
+    rows = tuple((name, *(number(entry.get(key)) for key, _, _ in columns)) for name, entry in measured.items())
+    heads, units = zip(*(column[1:] for column in columns))
+    return Table(title, ("", *heads), ("", *units), rows, caption)
+
+
+def _models(measured):
+    columns = [
+        ("flux_jy", "flux", "Jy"),
+        ("peak_jy_per_pixel", "peak", "Jy/pixel"),
+        ("negative_jy", "negative flux", "Jy"),
+        ("mdr", "MDR", ""),
+        ("fwhm_recovered_arcsec", "width of a point", "arcsec"),
+    ]
+    caption = (
+        "MDR: peak of the model over the brightest pixel outside of the source. Width of a point: full width at half "
+        "maximum of a point source added to the data, as it was recovered."
+    )
+    return _build("Models", columns, measured, caption)
+
+
+def _residuals(measured, weighting):
+    entries = {name: _flat(entry[weighting]) for name, entry in measured.items() if weighting in entry}
+    columns = [
+        ("sigma", "σ", "Jy/beam"),
+        ("max_abs", "largest |r|", "Jy/beam"),
+        ("peak", "peak restored", "Jy/beam"),
+        ("dr", "DR", ""),
+        ("skewness", "skewness", ""),
+        ("kurtosis", "kurtosis", ""),
+        ("whiteness", "whiteness", ""),
+        ("chi_square", "χ² of the blocks", ""),
+    ]
+    caption = (
+        "Residual images of all products made with one operator and the same weights. DR: peak of the restored image "
+        "over σ, the standard deviation of the residual image. χ² of the blocks: median, least and most."
+    )
+    return _build(f"Residual and restored images, {weighting} weighting", columns, entries, caption)
+
+
+def _flat(entry):
+    """Return the measures of one weighting with χ² of the blocks in words."""
+    chi = entry.get("chi_square")
+    if chi is None or not np.size(chi):
+        return {key: value for key, value in entry.items() if key != "chi_square"}
+    chi = np.atleast_1d(np.asarray(chi, float))
+    text = number(float(np.median(chi)), 3)
+    if chi.size > 1:
+        text += f" ({number(float(chi.min()), 3)} … {number(float(chi.max()), 3)})"
+    return {**entry, "chi_square": text}
+
+
+def _regions(measured):
+    names = list(dict.fromkeys(name for entry in measured.values() for name in entry.get("regions", {})))
+    if not names:
+        return None
+    rows = []
+    for name in names:
+        cells = []
+        for entry in measured.values():
+            found = entry.get("regions", {}).get(name, {})
+            cell = number(found.get("flux_jy"))
+            if found.get("error_jy") is not None:
+                cell += f" ± {number(found['error_jy'], 2)}"
+            cells.append(cell)
+        rows.append((name, *cells))
+    caption = "Flux within each region; the error, where there is one, is that of the noise of the restored image."
+    return Table("Regions", ("", *measured), ("", *["Jy"] * len(measured)), tuple(rows), caption)
+
+
+def _truth(measured):
+    entries = {name: entry["truth"] for name, entry in measured.items() if entry.get("truth")}
+    scales = sorted({scale for entry in entries.values() for scale in entry.get("snr_at_scale", {})}, key=float)
+    flat = {
+        name: {**entry, **{("scale", scale): value for scale, value in entry.get("snr_at_scale", {}).items()}}
+        for name, entry in entries.items()
+    }
+    columns = [("snr", "SNR", "dB"), ("log_snr", "log SNR", "dB"), ("ssim", "SSIM", "")]
+    columns += [(("scale", scale), f'SNR at {float(scale):.3g}"', "dB") for scale in scales]
+    caption = (
+        "SNR: norm of the truth over that of the error. Log SNR: the same of the images on a logarithmic scale, where "
+        "faint emission counts. SNR at a scale: both smoothed to that width."
+    )
+    return _build("Against the truth", columns, flat, caption)
+
+
+def _similarity(similarity):
+    found = {weighting: pairs for weighting, pairs in similarity.items() if pairs}
+    if not found:
+        return None
+    pairs = list(dict.fromkeys(pair for entry in found.values() for pair in entry))
+    rows = tuple((pair.replace("|", " and "), *(number(entry.get(pair), 3) for entry in found.values()))
+                 for pair in pairs)
+    caption = "S of two models smoothed with the CLEAN beam of each weighting: norm of the larger over the difference."
+    heads = ("", *(f"S, {weighting} beam" for weighting in found))
+    return Table("Similarity", heads, ("", *["dB"] * len(found)), rows, caption)
+
+
+def _layout(table) -> str:
+    """Return one table in columns, the first one to the left."""
+    lines = [table.heads, *([table.units] if any(table.units) else []), *table.rows]
+    widths = [max(len(cell) for cell in column) for column in zip(*lines)]
+    text = ["  ".join([line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:]))])
+            for line in lines]
+    return "\n".join([table.title, *("  " + line.rstrip() for line in text)])

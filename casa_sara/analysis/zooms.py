@@ -1,0 +1,67 @@
+"""Which parts of the sky are worth enlarging: the regions that were named, or else the brightest peaks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+__all__ = ["Zoom", "find_zooms", "reference"]
+
+MOST = 4
+SMALLEST = 12  # pixels
+
+
+@dataclass(frozen=True)
+class Zoom:
+    """A part of the grid: its name and its pixels x0 … x1 − 1, y0 … y1 − 1 as (x0, x1, y0, y1)."""
+
+    name: str
+    box: tuple[int, int, int, int]
+
+
+def reference(comparison) -> np.ndarray:
+    """Return the model that sets scales and zooms, Jy/pixel: the truth, or the first product's."""
+    return comparison.products[0].model if comparison.truth is None else comparison.truth
+
+
+def find_zooms(comparison, most: int = MOST) -> list[Zoom]:
+    """Return the boxes around the regions of a comparison, or around the brightest peaks when there are none.
+
+    Boxes are as high as they are wide on the sky and lie on the grid as far as it goes.
+    """
+    named = [(name, mask) for name, mask in comparison.regions.items() if np.any(mask)][:most]
+    if named:
+        return [_around_region(name, mask, comparison.cell_arcsec) for name, mask in named]
+    return _around_peaks(comparison, most)
+
+
+def _around_region(name, mask, cell) -> Zoom:
+    x, y = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    side = 1.3 * max((x[-1] - x[0] + 1) * cell[0], (y[-1] - y[0] + 1) * cell[1])
+    return Zoom(name, _box((x[0] + x[-1]) / 2, (y[0] + y[-1]) / 2, side, cell, mask.shape))
+
+
+def _around_peaks(comparison, most) -> list[Zoom]:
+    """Take peak after peak, each time blanking what the box before has shown."""
+    image = np.nan_to_num(reference(comparison))
+    cell, shape = comparison.cell_arcsec, image.shape
+    side = max(0.12 * max(shape[0] * cell[0], shape[1] * cell[1]), SMALLEST * max(cell))
+    left, zooms = gaussian_filter(image, 1.0), []
+    while len(zooms) < most and left.max() > 1e-3 * image.max() > 0:
+        x, y = np.unravel_index(np.argmax(left), shape)
+        box = _box(x, y, side, cell, shape)
+        zooms.append(Zoom(f"peak {len(zooms) + 1}", box))
+        left[box[0] : box[1], box[2] : box[3]] = 0
+    return zooms
+
+
+def _box(x, y, side, cell, shape) -> tuple[int, int, int, int]:
+    """Return a box of `side` arcsec around pixel (x, y), moved onto the grid."""
+    edges = []
+    for centre, width, size in zip((x, y), cell, shape):
+        pixels = min(max(int(round(side / width)), SMALLEST), size)
+        start = int(np.clip(round(centre - (pixels - 1) / 2), 0, size - pixels))
+        edges += [start, start + pixels]
+    return tuple(edges)
