@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "casa_sara"
 MODULES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))
 
-DISTRIBUTIONS = {"pywt": "PyWavelets"}  # where it is not the name of the import
+DISTRIBUTIONS = {"pywt": "PyWavelets", "PIL": "Pillow", "jinja2": "Jinja2"}  # where it is not the name of the import
 NOT_IMPORTED = {
     "casadata": "the data that CASA needs to be imported at all",
     "six": "casatasks imports it and does not require it",
@@ -41,7 +41,7 @@ ROOMS = {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },
     "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
-    "analysis": {"numpy", "scipy", "astropy", "regions", "matplotlib"},
+    "analysis": {"numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
     "jsonfile": set(),
 }
 LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")

@@ -22,7 +22,7 @@ def convergence(path, product) -> bool:
     """
     record = product.record
     history, bounds = record.get("history") or {}, record.get("bounds") or []
-    drawers = [(_change, "rel_change" in history), (_norms, "residual_norm" in history), (_bounds, bool(bounds))]
+    drawers = [(_change, "rel_change" in history), (_norms, "residual_norm" in history), (_bounds, len(bounds) > 0)]
     drawers = [draw for draw, there in drawers if there]
     if not drawers:
         return False
@@ -75,6 +75,8 @@ def _bounds(panel, record, end) -> None:
         named.add(ms)
         panel.plot(x, line, color=colours.get(ms, LINES[0]), lw=1.0, alpha=0.75, drawstyle="steps-post", label=shown)
     panel.set_ylabel(label[0])
+    if bounds.min() > 0 and (bounds / label[1]).max() > 10 * (bounds / label[1]).min():
+        panel.set_yscale("log")
     if 1 < len(colours) <= 7:
         panel.legend(fontsize=SMALL, frameon=False, loc="upper right", ncols=len(colours))
 

@@ -6,18 +6,19 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal.windows import tukey
 
-from casa_sara.analysis.sheets import DPI, LINES, plain
+from casa_sara.analysis.sheets import DPI, line, plain
 
 __all__ = ["histograms", "new_figure", "radial_spectrum", "spectra"]
 
 ARCSEC = np.pi / 180 / 3600
 TEXT, SMALL = {"fontsize": 10.5}, 9.5
+WEIGHTINGS = ("natural", "briggs")
 REACH = 8.0  # of a histogram, in standard deviations
 
 
-def new_figure(rows: int, columns: int, height: float, **options):
-    """Return a figure 11.5 inches wide and its axes, an array (rows, columns); `height` inches for each row."""
-    figure = Figure(figsize=(11.5, rows * height), dpi=DPI, facecolor="white", layout="constrained")
+def new_figure(rows: int, columns: int, height: float, width: float = 7.0, **options):
+    """Return a figure, 11.5 inches wide at most, and its axes (rows, columns); `height` inches for each row."""
+    figure = Figure(figsize=(min(11.5, width * columns), rows * height), dpi=DPI, facecolor="white", layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for panel in axes.flat:
         panel.tick_params(labelsize=SMALL)
@@ -66,52 +67,72 @@ def radial_spectrum(image, cell_arcsec, window: bool = False) -> tuple[np.ndarra
     return np.flatnonzero(filled) * width, mean[filled]
 
 
-def spectra(path, comparison) -> None:
-    """Draw the amplitude of the models against spatial frequency, and the power of each kind of residuals."""
-    weightings = [w for w in ("natural", "briggs") if any(w in product.residual for product in comparison.products)]
-    figure, axes = new_figure(1, 1 + len(weightings), 4.2)
-    panels, cell = axes[0], comparison.cell_arcsec
-    images = [(product.name, product.model, LINES[number % 7], "-") for number, product in
-              enumerate(comparison.products)]
+def spectra(path, comparison) -> bool:
+    """Draw the amplitude of the models against spatial frequency, and the power of each kind of residuals.
+
+    Tell whether anything was there to draw.
+    """
+    images = [(product.name, product.model, line(number)) for number, product in enumerate(comparison.products)]
     if comparison.truth is not None:
-        images.insert(0, ("truth", comparison.truth, "0.35", ":"))
-    lowest = np.inf
-    for name, image, colour, style in images:
-        frequency, power = radial_spectrum(image, cell)
-        panels[0].plot(frequency[1:] / 1e3, np.sqrt(power[1:]), style, color=colour, lw=1.6, label=plain(name))
-        lowest = min(lowest, *np.sqrt(power[1:]))
-    top = max(np.sqrt(radial_spectrum(image, cell)[1][0]) for _, image, _, _ in images)
-    panels[0].set(xscale="log", yscale="log", ylabel="mean amplitude [Jy]")
-    if top > 0:
-        panels[0].set_ylim(bottom=max(lowest, 1e-7 * top) / 1.5)
-    panels[0].set_title("models", **TEXT)
-    for panel, weighting in zip(panels[1:], weightings):
-        for number, product in enumerate(comparison.products):
-            if weighting in product.residual:
-                residual = product.residual[weighting]
-                frequency, power = radial_spectrum(residual, cell, window=True)
-                power /= np.nanvar(residual) * residual.size or 1
-                shown = power > 0
-                panel.plot(frequency[shown][1:] / 1e3, power[shown][1:], color=LINES[number % 7], lw=1.4,
-                           label=plain(product.name))
-        panel.axhline(1, color="0.3", ls="--", lw=1)
-        panel.set(xscale="log", yscale="log", ylabel="power over that of white noise")
-        bottom = panel.get_ylim()[0]
-        panel.set_ylim(bottom=max(bottom, 1e-5))
-        panel.set_title(f"residuals, {weighting}", **TEXT)
-    for panel in panels:
+        images.insert(0, ("truth", comparison.truth, {"color": "0.35", "ls": ":"}))
+    images = [image for image in images if np.any(np.nan_to_num(image[1]))]
+    if not images:
+        return False
+    weightings = [w for w in WEIGHTINGS if any(_has_noise(product, w) for product in comparison.products)]
+    figure, axes = new_figure(1, 1 + len(weightings), 4.2)
+    _model_spectra(axes[0, 0], images, comparison.cell_arcsec)
+    for panel, weighting in zip(axes[0, 1:], weightings):
+        _residual_spectra(panel, comparison, weighting)
+    for panel in axes.flat:
         for weighting, beam in comparison.beams.items():
             edge = 1 / (np.sqrt(beam[0] * beam[1]) * ARCSEC) / 1e3
             panel.axvline(edge, color="0.6", lw=1, ls="-." if weighting == "natural" else "-")
+        panel.set(xscale="log", yscale="log")
         panel.set_xlabel("spatial frequency [kλ]", **TEXT)
         panel.yaxis.label.set_size(10.5)
         panel.legend(fontsize=SMALL, frameon=False, loc="lower left")
     figure.savefig(path)
+    return True
+
+
+def _model_spectra(panel, images, cell) -> None:
+    """Draw spectra of models over no more than seven decades."""
+    lowest, highest = np.inf, 0.0
+    for name, image, style in images:
+        frequency, power = radial_spectrum(image, cell)
+        amplitude = np.sqrt(power)
+        panel.plot(frequency[1:] / 1e3, amplitude[1:], lw=1.6, label=plain(name), **style)
+        lowest, highest = min(lowest, amplitude[1:].min()), max(highest, amplitude.max())
+    panel.set_ylim(max(lowest, 1e-7 * highest) / 1.5, 2 * highest)
+    panel.set_ylabel("mean amplitude [Jy]")
+    panel.set_title("models", **TEXT)
+
+
+def _residual_spectra(panel, comparison, weighting) -> None:
+    """Draw spectra of residuals over no more than seven decades."""
+    lowest, highest = np.inf, 1.0
+    for number, product in enumerate(comparison.products):
+        if not _has_noise(product, weighting):
+            continue
+        residual = product.residual[weighting]
+        frequency, power = radial_spectrum(residual, comparison.cell_arcsec, window=True)
+        power /= np.nanvar(residual) * residual.size
+        panel.plot(frequency[1:] / 1e3, power[1:], lw=1.4, label=plain(product.name), **line(number))
+        lowest, highest = min(lowest, power[1:].min()), max(highest, power.max())
+    panel.axhline(1, color="0.3", ls="--", lw=1)
+    panel.set_ylim(max(lowest, 1e-7 * highest) / 1.5, 2 * highest)
+    panel.set_ylabel("power over that of white noise")
+    panel.set_title(f"residuals, {weighting}", **TEXT)
+
+
+def _has_noise(product, weighting) -> bool:
+    """Tell whether there is a residual image that is not constant."""
+    return weighting in product.residual and np.nanstd(product.residual[weighting]) > 0
 
 
 def histograms(path, comparison) -> bool:
     """Draw the histograms of the residuals against the Gaussian; tell whether there are residuals."""
-    weightings = [w for w in ("natural", "briggs") if any(w in product.residual for product in comparison.products)]
+    weightings = [w for w in WEIGHTINGS if any(_has_noise(product, w) for product in comparison.products)]
     if not weightings:
         return False
     figure, axes = new_figure(1, len(weightings), 4.0, sharey=True)
@@ -120,18 +141,18 @@ def histograms(path, comparison) -> bool:
     for panel, weighting in zip(axes[0], weightings):
         smallest = np.inf
         for number, product in enumerate(comparison.products):
-            residual = product.residual.get(weighting)
-            values = residual[np.isfinite(residual)] if residual is not None else np.zeros(0)
-            if not values.std() > 0:
+            if not _has_noise(product, weighting):
                 continue
+            values = product.residual[weighting]
+            values = values[np.isfinite(values)]
             scaled = (values - values.mean()) / values.std()
             counts = np.histogram(np.clip(scaled, -REACH, REACH), edges)[0] / (width * values.size)
             smallest = min(smallest, 1 / (width * values.size))
             label = f"{plain(product.name)}, extreme {np.abs(scaled).max():.1f} σ"
-            panel.stairs(np.where(counts > 0, counts, np.nan), edges, color=LINES[number % 7], lw=1.6, label=label)
+            panel.stairs(np.where(counts > 0, counts, np.nan), edges, lw=1.6, label=label, **line(number))
         panel.plot(middle, np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi), color="0.25", ls="--", lw=1.2,
                    label="Gaussian")
-        panel.set(yscale="log", xlim=(-REACH, REACH), ylim=(min(smallest, 1e-3) / 2, 4))
+        panel.set(yscale="log", xlim=(-REACH, REACH), ylim=(min(smallest, 1e-3) / 2, 2 * 10 ** (0.4 * len(comparison.products) + 0.4)))
         panel.set_xlabel("residual / its standard deviation σ", **TEXT)
         panel.set_title(f"residuals, {weighting}", **TEXT)
         panel.legend(fontsize=SMALL, frameon=False, loc="upper left")

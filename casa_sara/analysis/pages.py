@@ -35,7 +35,7 @@ def smoothed(comparison, image, weighting: str) -> np.ndarray:
     """Return an image in Jy/pixel convolved with the CLEAN beam of a weighting, still in Jy/pixel."""
     major, minor, angle = comparison.beams[weighting]
     cell = np.sqrt(np.prod(comparison.cell_arcsec))
-    return metrics.smooth(image, (major / cell, minor / cell), angle)
+    return metrics.smooth(np.nan_to_num(image), (major / cell, minor / cell), angle)
 
 
 def overview(path, comparison, weighting: str | None = None) -> None:
@@ -87,19 +87,19 @@ def zoomed(path, comparison) -> bool:
     for zoom in zooms:
         x0, x1, y0, y1 = zoom.box
         centre = SkyCoord(*wcs.wcs_pix2world((x0 + x1 - 1) / 2, (y0 + y1 - 1) / 2, 0), unit="deg")
-        columns.append(centre.to_string("hmsdms", precision=1, format="unicode") if len(zooms) < 4 else "")
+        columns.append(centre.to_string("hmsdms", precision=1, format="unicode"))
     rows = ([("truth", comparison.truth)] if comparison.truth is not None else []) + [
         (product.name, product.model) for product in comparison.products
     ]
     norm, factor, unit = _brightness(comparison)
-    sheet = Sheet([row[0] for row in rows], columns, 1.0)
+    sheet = Sheet([row[0] for row in rows], columns, 1.0, widest=2.75)
     for row, (_, model) in enumerate(rows):
         for column, zoom in enumerate(zooms):
             panel = sheet.panel(row, column)
             draw(panel, model / np.prod(cell) * factor, norm, cell)
             _cut(panel, zoom, cell)
-            for weighting, beam in list(comparison.beams.items())[-1:]:
-                draw_beam(panel, beam, cell, right=True)
+            if comparison.beams:
+                draw_beam(panel, min(comparison.beams.values(), key=beam_area), cell, right=True)
     sheet.bar(0, len(zooms) - 1, norm, BRIGHTNESS_MAP, unit)
     sheet.save(path)
     return True

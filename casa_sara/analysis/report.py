@@ -15,6 +15,7 @@ from casa_sara.analysis import animation, convergence, diagnostics, pages
 from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.sheets import DPI
 from casa_sara.analysis.tables import tables
+from casa_sara.analysis.zooms import find_zooms
 
 __all__ = ["Picture", "write_report"]
 
@@ -86,8 +87,9 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
 
 def _sky(comparison, folder, frames) -> list[Picture]:
     """Draw the pictures of the sky."""
-    stretch = "One logarithmic scale for all that is per arcsec²; residuals have a scale of their own."
-    boxes = " Boxes are enlarged below; ellipses are the CLEAN beam."
+    stretch = "One logarithmic scale for all that is per arcsec²" + (
+        "; residuals have a scale of their own. Ellipses are the CLEAN beam." if comparison.beams else ".")
+    boxes = " Boxes are enlarged below." if find_zooms(comparison) else ""
     made = []
     for weighting in list(comparison.beams) or [None]:
         path = folder / (f"sky_{weighting}.png" if weighting else "sky.png")
@@ -97,7 +99,8 @@ def _sky(comparison, folder, frames) -> list[Picture]:
     path = folder / "zooms.png"
     if pages.zoomed(path, comparison):
         made.append(Picture(path, "sky", "Models, enlarged",
-                            "The scale is that of the pictures above; the ellipse is the finest CLEAN beam."))
+                            "The scale is that of the picture above." +
+                            (" The ellipse is the finest CLEAN beam." if comparison.beams else "")))
     path = folder / "differences.png"
     if pages.differences(path, comparison):
         what = "the first product" if comparison.truth is None else "the truth"
@@ -114,18 +117,21 @@ def _sky(comparison, folder, frames) -> list[Picture]:
 
 def _residuals(comparison, folder) -> list[Picture]:
     """Draw the spectra and histograms."""
+    made = []
     path = folder / "spectra.png"
-    diagnostics.spectra(path, comparison)
     caption = (
-        "Averages over rings of the Fourier plane. Left: where a model falls below the truth, or below the others, it "
-        "resolves no further. Vertical lines: one over the width of the CLEAN beam (dash-dotted: natural)."
+        "Averages over rings of the Fourier plane. Where a model falls below the truth, or below the others, it resolves "
+        "no further."
     )
+    if comparison.beams:
+        caption += " Vertical lines: one over the width of the CLEAN beam (dash-dotted: natural)."
     if any(product.residual for product in comparison.products):
         caption += (
-            " Right: residuals that are noise follow the weights of the data; what one product has more than the "
-            "others was left unmodelled at that scale."
+            " Residuals that are noise follow the weights of the data; what one product has more than the others was "
+            "left unmodelled at that scale."
         )
-    made = [Picture(path, "residuals", "Radial power spectra", caption)]
+    if diagnostics.spectra(path, comparison):
+        made.append(Picture(path, "residuals", "Radial power spectra", caption))
     path = folder / "histograms.png"
     if diagnostics.histograms(path, comparison):
         made.append(Picture(path, "residuals", "Histograms of the residuals", "Noise follows the Gaussian. Wings: "

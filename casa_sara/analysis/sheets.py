@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from astropy.wcs import WCS
+from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
@@ -18,14 +19,19 @@ from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.transforms import Affine2D
 
 __all__ = ["BRIGHTNESS_MAP", "DIFFERENCE_MAP", "DPI", "LINES", "Sheet", "beam_area", "celestial", "draw", "draw_beam",
-           "outline", "plain", "prefix"]
+           "line", "outline", "plain", "prefix"]
 
 BRIGHTNESS_MAP, DIFFERENCE_MAP = "inferno", "RdBu_r"
 LINES = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # Okabe and Ito
 DPI = 150
-WIDEST, WIDEST_PANEL = 11.5, 5.0  # of a sheet and of a panel, in inches
+WIDEST = 11.5  # of a sheet, in inches
 LEFT, RIGHT, TOP, GAP, HEADING, BAR = 0.9, 0.15, 0.3, 0.08, 0.3, 1.15  # BAR: labels and colour bars below the panels
 TEXT = {"fontsize": 9.5}
+
+
+def line(number: int) -> dict[str, str]:
+    """Return colour and style of the line of the product of this number."""
+    return {"color": LINES[number % len(LINES)], "ls": ("-", "--", "-.", ":")[number // len(LINES) % 4]}
 
 
 def plain(text) -> str:
@@ -71,16 +77,19 @@ class Sheet:
         Height over width of a panel.
     wcs : astropy.wcs.WCS, optional
         Coordinates of the panels; without them the panels have no labels.
+    widest : float
+        Limit of the width of a panel, in inches.
     """
 
     rows: Sequence[str]
     columns: Sequence[str]
     aspect: float
     wcs: WCS | None = None
+    widest: float = 5.0
 
     def __post_init__(self):
         count, left = len(self.columns), LEFT if self.wcs else RIGHT
-        self.side = min((WIDEST - left - RIGHT - GAP * (count - 1)) / count, WIDEST_PANEL, 9 / self.aspect)
+        self.side = min((WIDEST - left - RIGHT - GAP * (count - 1)) / count, self.widest, 9 / self.aspect)
         self.step = self.side * self.aspect + HEADING
         width = left + count * (self.side + GAP) - GAP + RIGHT
         self.bottom = BAR if self.wcs else BAR - 0.4
@@ -141,8 +150,8 @@ def draw(axes, image, norm: Normalize, cell, colours: str = BRIGHTNESS_MAP) -> N
     shown = np.ma.masked_invalid(np.asarray(image, float))
     if isinstance(norm, LogNorm):
         shown = np.ma.maximum(shown, norm.vmin)
-    drawn = axes.imshow(shown.T, origin="lower", norm=norm, cmap=colours, aspect=cell[1] / cell[0])
-    drawn.get_cmap().set_bad("0.6")
+    shades = colormaps[colours].with_extremes(bad="0.6")
+    axes.imshow(shown.T, origin="lower", norm=norm, cmap=shades, aspect=cell[1] / cell[0])
 
 
 def draw_beam(axes, beam, cell, colour: str = "white", right: bool = False) -> None:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casa_sara.analysis.sheets import prefix
+
 __all__ = ["Table", "as_text", "number", "tables"]
 
 NOTHING = "–"
@@ -65,9 +67,35 @@ def _build(title, columns, measured, caption="") -> Table | None:
     columns = [column for column in columns if any(column[0] in entry for entry in measured.values())]
     if not columns:
         return None
-    rows = tuple((name, *(number(entry.get(key)) for key, _, _ in columns)) for name, entry in measured.items())
-    heads, units = zip(*(column[1:] for column in columns))
-    return Table(title, ("", *heads), ("", *units), rows, caption)
+    units, texts = zip(*(_column([entry.get(key) for entry in measured.values()], unit) for key, _, unit in columns))
+    rows = tuple((name, *cells) for name, *cells in zip(measured, *texts))
+    return Table(title, ("", *(head for _, head, _ in columns)), ("", *units), rows, caption)
+
+
+def _column(values, unit) -> tuple[str, list[str]]:
+    """Return the unit of a column and its numbers in that unit, with one number of decimals where that says enough."""
+    finite = [abs(float(value)) for value in values if _is_number(value) and value != 0]
+    if not finite:
+        return unit, [number(value) for value in values]
+    if unit == "dB":
+        return unit, [_fixed(value, 1) for value in values]
+    factor, sign = prefix(max(finite)) if unit.startswith("Jy") else (1.0, "")
+    values = [value * factor if _is_number(value) else value for value in values]
+    largest, least = max(finite) * factor, min(finite) * factor
+    decimals = max(3 - int(np.floor(np.log10(largest))), 0)
+    if not unit:  # ratios and moments
+        decimals = min(decimals, 0 if largest >= 100 else 1 if largest >= 10 else 3)
+    if largest >= 1e7 or least < 2 * 10.0**-decimals:
+        return sign + unit, [number(value, 3) for value in values]
+    return sign + unit, [_fixed(value, decimals) for value in values]
+
+
+def _is_number(value) -> bool:
+    return isinstance(value, (int, float, np.number)) and bool(np.isfinite(value))
+
+
+def _fixed(value, decimals) -> str:
+    return f"{value:,.{decimals}f}".replace("-", "−") if _is_number(value) else number(value)
 
 
 def _models(measured):
@@ -112,7 +140,7 @@ def _flat(entry):
     chi = np.atleast_1d(np.asarray(chi, float))
     text = number(float(np.median(chi)), 3)
     if chi.size > 1:
-        text += f" ({number(float(chi.min()), 3)} … {number(float(chi.max()), 3)})"
+        text += f" ({number(float(chi.min()), 3)}–{number(float(chi.max()), 3)})"
     return {**entry, "chi_square": text}
 
 
@@ -155,7 +183,7 @@ def _similarity(similarity):
     if not found:
         return None
     pairs = list(dict.fromkeys(pair for entry in found.values() for pair in entry))
-    rows = tuple((pair.replace("|", " and "), *(number(entry.get(pair), 3) for entry in found.values()))
+    rows = tuple((pair.replace("|", " and "), *(_fixed(entry.get(pair), 1) for entry in found.values()))
                  for pair in pairs)
     caption = "S of two models smoothed with the CLEAN beam of each weighting: norm of the larger over the difference."
     heads = ("", *(f"S, {weighting} beam" for weighting in found))

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, maximum_filter
 
 __all__ = ["Zoom", "find_zooms", "reference"]
 
 MOST = 4
-SMALLEST = 12  # pixels
+SMALLEST = 12  # side of a box, in pixels
+FAINTEST = 1e-3  # peak, as part of the brightest
 
 
 @dataclass(frozen=True)
@@ -44,17 +45,15 @@ def _around_region(name, mask, cell) -> Zoom:
 
 
 def _around_peaks(comparison, most) -> list[Zoom]:
-    """Take peak after peak, each time blanking what the box before has shown."""
+    """Take the highest peaks, no two of them within one box."""
     image = np.nan_to_num(reference(comparison))
     cell, shape = comparison.cell_arcsec, image.shape
     side = max(0.12 * max(shape[0] * cell[0], shape[1] * cell[1]), SMALLEST * max(cell))
-    left, zooms = gaussian_filter(image, 1.0), []
-    while len(zooms) < most and left.max() > 1e-3 * image.max() > 0:
-        x, y = np.unravel_index(np.argmax(left), shape)
-        box = _box(x, y, side, cell, shape)
-        zooms.append(Zoom(f"peak {len(zooms) + 1}", box))
-        left[box[0] : box[1], box[2] : box[3]] = 0
-    return zooms
+    softened = gaussian_filter(image, 1.0)  # two pixels that share a source make one peak
+    highest = maximum_filter(softened, [max(int(round(side / width)), 3) for width in cell])
+    peaks = np.argwhere((softened == highest) & (softened > FAINTEST * softened.max()))
+    peaks = sorted(peaks, key=lambda peak: -softened[tuple(peak)])[:most]
+    return [Zoom(f"peak {number}", _box(*peak, side, cell, shape)) for number, peak in enumerate(peaks, 1)]
 
 
 def _box(x, y, side, cell, shape) -> tuple[int, int, int, int]:

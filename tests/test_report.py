@@ -1,0 +1,265 @@
+"""The report: pictures that follow the data, a page that is whole, harmless and fits the window."""
+
+import dataclasses
+import html.parser
+import re
+import shutil
+import subprocess
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic_comparison import BEAMS, CELL, SHAPE, comparison, measures, record
+
+from casa_sara.analysis import animation, convergence, diagnostics, pages, zooms
+from casa_sara.analysis.comparison import Product
+from casa_sara.analysis.report import write_report
+from casa_sara.analysis.sheets import celestial
+from casa_sara.analysis.tables import as_text, number, tables
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
+EVIL = '<script>alert("1")</script>$x_$ & co'
+FRAMES = [("coarse", np.ones((8, 6)), 0.4), ("fine", np.eye(16, 12) + 1, 0.2)]
+
+
+class Page(html.parser.HTMLParser):
+    """Ids, texts of headings, tags, and what the page would load."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.ids, self.tags, self.links, self.titles, self.text = [], [], [], [], ""
+        self.source = path.read_text(encoding="utf-8")
+        self.feed(self.source)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href", "srcset", "data", "poster", "action"):
+                self.links.append(value)
+
+    def handle_data(self, data):
+        self.text += data
+        if self.lasttag in ("h1", "h2", "h3") and data.strip():
+            self.titles.append(data.strip())
+
+
+@pytest.fixture(scope="module")
+def full():
+    return comparison()
+
+
+@pytest.fixture(scope="module")
+def report(full, tmp_path_factory):
+    return write_report(full, tmp_path_factory.mktemp("report"), title="A test", frames=FRAMES)
+
+
+def pixels(path):
+    return np.asarray(Image.open(path).convert("RGB"), float)
+
+
+def test_report_has_every_section_and_picture(report):
+    page = Page(report)
+    assert page.ids == ["warnings", "measures", "sky", "residuals", "runs", "notes", "parameters", "versions"]
+    expected = ["Models", "Residual and restored images, natural weighting", "Regions", "Against the truth",
+                "Similarity", "All products, natural weighting", "All products, briggs weighting", "Models, enlarged",
+                "Differences", "From coarse to fine pixels", "Radial power spectra", "Histograms of the residuals",
+                "Convergence of tsara", "Calibration of tsara, block by block"]  # fmt: skip
+    assert set(expected) <= set(page.titles)
+    drawn = {path.name for path in report.parent.glob("*.png")}
+    assert drawn == {"sky_natural.png", "sky_briggs.png", "zooms.png", "differences.png", "cells.png", "spectra.png",
+                     "histograms.png", "convergence_1.png", "blocks_1.png"}  # fmt: skip
+    assert page.tags.count("img") == len(drawn)
+    for word in ("imsize", "1.2.3", "one sample was wild & left out", "0.1160 ± 0.0013", "weighting"):
+        assert word in page.text
+
+
+def test_report_is_self_contained(report):
+    page = Page(report)
+    assert all(link.startswith(("data:image/png;base64,", "#")) for link in page.links)
+    assert {link[1:] for link in page.links if link.startswith("#")} <= set(page.ids)
+    assert "script" not in page.tags and "link" not in page.tags
+    assert not re.search(r"https?://|file:|@import|url\(", page.source)
+
+
+def test_what_comes_from_data_is_escaped(tmp_path):
+    made = comparison(names=(EVIL, "other"))
+    first = dataclasses.replace(made.products[0], parameters={EVIL: EVIL})
+    blocks = [{**block, "ms": EVIL} for block in first.record["blocks"]]
+    first = dataclasses.replace(first, record={**first.record, "blocks": blocks})
+    masks = {EVIL: made.regions["core"]}
+    products = (first, made.products[1])
+    made = dataclasses.replace(made, products=products, regions=masks, versions={EVIL: EVIL}, notes=(EVIL,),
+                               measures=measures(products, made.truth, masks))
+    page = Page(write_report(made, tmp_path, title=EVIL))
+    assert "script" not in page.tags and "<script" not in page.source
+    assert page.text.count(EVIL) > 10
+    assert EVIL in as_text(made)
+
+
+def test_single_product(tmp_path):
+    made = comparison(names=("tsara",), with_truth=False, with_regions=False)
+    page = Page(write_report(made, tmp_path))
+    assert {"measures", "sky", "residuals", "runs", "notes"} <= set(page.ids)
+    assert not {"Similarity", "Differences", "Against the truth", "Regions"} & set(page.titles)
+    assert "S says how alike" not in page.text and "parameters that differ" not in page.text
+    assert "Boxes are enlarged" in page.text  # the brightest peaks
+
+
+@pytest.mark.parametrize("model", [np.ones(SHAPE), np.zeros(SHAPE), np.full(SHAPE, -1.0)])
+def test_nothing_but_a_model(tmp_path, model):
+    made = dataclasses.replace(comparison(), products=(Product("one", model),), truth=None, beams={}, regions={},
+                               measures={}, versions={}, notes=())
+    page = Page(write_report(made, tmp_path))
+    assert set(page.ids) in ({"sky", "residuals", "notes"}, {"sky", "notes"})
+    assert (tmp_path / "sky.png").exists()
+    assert "DR" not in page.text and "beam" not in page.text.replace("Smoothing", "")
+    assert ("negative pixels here: one" in page.text) == (model.min() < 0)
+    assert as_text(made) == "nothing was measured\n"
+
+
+@pytest.mark.parametrize("missing", ["history", "bounds", "reweightings", "blocks"])
+def test_parts_of_a_record(tmp_path, missing):
+    parts = {key: value for key, value in record().items() if key != missing}
+    made = Product("tsara", np.ones(SHAPE), record=parts)
+    assert convergence.convergence(tmp_path / "c.png", made)
+    assert convergence.block_noise(tmp_path / "b.png", made) == (missing != "blocks")
+    assert not convergence.convergence(tmp_path / "n.png", Product("other", np.ones(SHAPE)))
+    assert not (tmp_path / "n.png").exists()
+
+
+def test_blank_pixels_and_zero_residuals(tmp_path):
+    made = comparison(names=("one", "two"))
+    model = made.products[0].model.copy()
+    model[:5] = np.nan
+    zero = {weighting: np.zeros(SHAPE) for weighting in BEAMS}
+    products = (dataclasses.replace(made.products[0], model=model),
+                dataclasses.replace(made.products[1], residual=zero))
+    assert write_report(dataclasses.replace(made, products=products), tmp_path).exists()
+
+
+def test_pictures_differ_where_the_data_do(tmp_path, full):
+    """A source put into the last residual image shows there, in red, at its place, and nowhere else."""
+    last = full.products[-1]  # with the largest residuals: the scales, of the median and the least, stay
+    residual = {weighting: image.copy() for weighting, image in last.residual.items()}
+    residual["natural"][5:20, 45:60] += 3e-3
+    changed = dataclasses.replace(full, products=(*full.products[:-1], dataclasses.replace(last, residual=residual)))
+    for name, made in (("before", full), ("after", changed)):
+        pages.overview(tmp_path / f"{name}.png", made, "natural")
+        diagnostics.histograms(tmp_path / f"{name}_histogram.png", made)
+    before, after = pixels(tmp_path / "before.png"), pixels(tmp_path / "after.png")
+    assert before.shape == after.shape
+    rows, columns = np.nonzero(np.abs(after - before).sum(axis=2) > 30)
+    panel = (SHAPE[0] * 4.0, SHAPE[1] * 4.0)  # of about 400 screen pixels, as four panels share 11.5 inches
+    assert np.ptp(columns) == pytest.approx(15 / SHAPE[0] * panel[0], rel=0.1)
+    assert np.ptp(rows) == pytest.approx(15 / SHAPE[1] * panel[1], rel=0.1)
+    height, width = before.shape[:2]
+    assert 0.76 * width < columns.min() and columns.max() < 0.85 * width  # the left of the last column
+    assert 0.65 * height < rows.min() and rows.max() < 0.8 * height  # the top of the last row
+    colours = after[rows, columns]
+    assert np.mean(colours[:, 0] > colours[:, 2] + 50) > 0.95
+    assert np.any(pixels(tmp_path / "before_histogram.png") != pixels(tmp_path / "after_histogram.png"))
+
+
+def test_axes_put_north_up_and_east_left(full):
+    wcs = celestial(full)
+    centre = wcs.wcs_pix2world([[SHAPE[0] // 2, SHAPE[1] // 2]], 0)[0]
+    np.testing.assert_allclose(centre, full.centre_deg, atol=1e-10)
+    east, north = wcs.wcs_pix2world([[SHAPE[0] // 2 - 10, SHAPE[1] // 2], [SHAPE[0] // 2, SHAPE[1] // 2 + 10]], 0)
+    scale = 3600 / CELL / 10
+    assert (east[0] - centre[0]) * np.cos(np.deg2rad(centre[1])) * scale == pytest.approx(1, rel=1e-6)
+    assert (north[1] - centre[1]) * scale == pytest.approx(1, rel=1e-6)
+
+
+def test_zooms_are_around_regions_or_peaks(full):
+    found = {zoom.name: zoom.box for zoom in zooms.find_zooms(full)}
+    assert list(found) == ["core", "lobe"]
+    x0, x1, y0, y1 = found["core"]
+    assert x0 <= 18 and x1 >= 33 and y0 <= 14 and y1 >= 28 and x1 - x0 == y1 - y0
+    peaks = zooms.find_zooms(dataclasses.replace(full, regions={}))
+    for x, y in ((25, 20), (60, 20), (70, 45)):
+        assert any(z.box[0] <= x < z.box[1] and z.box[2] <= y < z.box[3] for z in peaks)
+
+
+def test_spectrum_of_white_noise_and_of_a_point():
+    noise = np.random.default_rng(1).standard_normal((128, 96)) * 3
+    for window in (False, True):
+        frequency, power = diagnostics.radial_spectrum(noise, (0.1, 0.1), window)
+        assert np.mean(power[5:]) == pytest.approx(9 * noise.size, rel=0.05)
+    point = np.zeros((32, 31))
+    point[7, 9] = 2.0
+    frequency, power = diagnostics.radial_spectrum(point, (0.1, 0.2))
+    np.testing.assert_allclose(power, 4.0)
+    assert frequency[-1] == pytest.approx(0.5 / np.deg2rad(0.2 / 3600), rel=0.1)
+
+
+def test_spectrum_is_at_the_frequency_of_a_wave():
+    wave = np.cos(2 * np.pi * 10 * np.arange(64) / 64)[:, None] * np.ones((1, 48))
+    frequency, power = diagnostics.radial_spectrum(wave, (0.1, 0.1))
+    assert frequency[np.argmax(power)] == pytest.approx(10 / 6.4 / np.deg2rad(1 / 3600))
+
+
+def test_animation_has_a_frame_for_each_image(tmp_path):
+    path = tmp_path / "cells.png"
+    animation.animate(path, FRAMES, zoom=(0.0, 0.0, 1.6))
+    with Image.open(path) as image:
+        assert image.n_frames == 2
+        first = np.asarray(image.convert("RGB"), float)
+        image.seek(1)
+        assert np.any(np.asarray(image.convert("RGB"), float) != first)
+    with pytest.raises(ValueError, match="zoom=.* holds no emission"):
+        animation.animate(path, FRAMES, zoom=(50.0, 0.0, 1.0))
+    with pytest.raises(ValueError, match="frames is empty"):
+        animation.animate(path, [])
+
+
+def test_table_as_text(full):
+    text = as_text(full)
+    titles = [table.title for table in tables(full)]
+    assert len(titles) == 6 and all(title in text for title in titles)
+    assert "note: one sample was wild & left out" in text
+    flux = full.measures["products"]["tsara"]["flux_jy"]
+    assert re.search(rf"^ +flux .*\n +mJy .*\n  tsara +{1e3 * flux:.1f} ", text, re.MULTILINE)
+    for table in tables(full):
+        assert {len(row) for row in (table.heads, table.units, *table.rows)} == {len(table.heads)}
+    widths = [len(line.rstrip()) for line in text.split("\n\n")[0].splitlines()[1:2] + text.splitlines()[3:6]]
+    assert len(set(widths)) == 1  # columns end below each other
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (float("nan"), "–"), (float("inf"), "∞"), (-float("inf"), "−∞"), (0, "0"), (0.0, "0"),
+     (12345.6, "12,346"), (1.5, "1.500"), (-0.25, "−0.2500"), (2.5e-5, "2.500e−5"), ("text", "text")],
+)  # fmt: skip
+def test_numbers(value, text):
+    assert number(value) == text
+
+
+def test_what_was_not_measured_is_left_out(full):
+    measured = {"products": {"tsara": {"flux_jy": 1.0}, "tclean briggs": {"flux_jy": 2.0, "mdr": float("inf")}},
+                "similarity": {"natural": {"tsara|tclean briggs": float("inf")}}}
+    made = tables(dataclasses.replace(full, measures=measured))
+    assert [table.title for table in made] == ["Models", "Similarity"]
+    assert made[0].rows == (("tsara", "1.000", "–"), ("tclean briggs", "2.000", "∞"))
+    assert made[1].rows == (("tsara and tclean briggs", "∞"),)
+
+
+@pytest.mark.skipif(not CHROMIUM, reason="no Chromium to render the page")
+@pytest.mark.parametrize("width", [1024, 1400])
+def test_page_fits_the_window(report, width, tmp_path):
+    """The page is no wider than the window: asked of the layout, and seen at the right edge of a screenshot."""
+    probe = tmp_path / "probe.html"
+    script = "<script>document.title = document.documentElement.scrollWidth + ' ' + innerWidth</script></body>"
+    probe.write_text(report.read_text(encoding="utf-8").replace("</body>", script), encoding="utf-8")
+    picture = tmp_path / "page.png"
+    browser = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
+               f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},3000"]
+    dom = subprocess.run([*browser, "--dump-dom", probe.as_uri()], capture_output=True, text=True, timeout=120)
+    title = re.search(r"<title>(\d+) (\d+)</title>", dom.stdout)
+    assert title and title[1] == title[2] == str(width)
+    subprocess.run([*browser, f"--screenshot={picture}", report.as_uri()], capture_output=True, check=True, timeout=120)
+    page = pixels(picture)
+    assert page.shape == (3000, width, 3)
+    assert np.all(page[:, -8:] == 255)
+    assert np.mean(page != 255) > 0.05 and len(np.unique(page.astype(np.uint8).reshape(-1, 3), axis=0)) > 100
