@@ -69,6 +69,7 @@ def _frame(title, image, cell, zoom, scale) -> Image.Image:
     axes = figure.subplots()
     drawn = axes.imshow(np.maximum(image, norm.vmin).T, origin="lower", extent=_edges(image.shape, cell), norm=norm,
                         cmap=BRIGHTNESS_MAP, interpolation="nearest")
+    axes.set_facecolor("0.6")  # beyond the image
     axes.set(xlim=(east + side / 2, east - side / 2), ylim=(north - side / 2, north + side / 2))
     axes.set_title(f'{plain(title)} ({cell:.3g}" pixels)', fontsize=11)
     axes.set_xlabel("east [arcsec]", fontsize=10)

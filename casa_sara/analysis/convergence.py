@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta
+from pathlib import Path
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from casa_sara.analysis.sheets import LINES, plain
 __all__ = ["block_noise", "convergence"]
 
 MOST_LABELS = 40  # scans that are named in the picture of the noise
+LONGEST = 26  # letters of the name of a MeasurementSet
 LONG_GAP_S = 3 * 3600.0
 
 
@@ -26,7 +28,7 @@ def convergence(path, product) -> bool:
     drawers = [draw for draw, there in drawers if there]
     if not drawers:
         return False
-    figure, axes = new_figure(len(drawers), 1, 2.5, sharex=True)
+    figure, axes = new_figure(len(drawers), 1, 2.5, width=11.5, sharex=True)
     end = max([*np.atleast_1d(history.get("iteration", 0)), *(entry["iteration"] for entry in bounds),
                *(entry["iteration"] for entry in record.get("reweightings") or [])])
     for draw, panel in zip(drawers, axes[:, 0]):
@@ -68,10 +70,10 @@ def _bounds(panel, record, end) -> None:
     x, bounds = _steps(record, end)
     blocks = record.get("blocks") or []
     label, colours = _bound_unit(blocks, bounds)
-    named = set()
+    names, named = _short(colours), set()
     for j, line in enumerate((bounds / label[1]).T):
         ms = blocks[j]["ms"] if j < len(blocks) else ""
-        shown = plain(ms) if ms and ms not in named else None
+        shown = names[ms] if ms in names and ms not in named else None
         named.add(ms)
         panel.plot(x, line, color=colours.get(ms, LINES[0]), lw=1.0, alpha=0.75, drawstyle="steps-post", label=shown)
     panel.set_ylabel(label[0])
@@ -95,6 +97,15 @@ def _colours(blocks) -> dict[str, str]:
     return {name: LINES[number % len(LINES)] for number, name in enumerate(names)}
 
 
+def _short(names) -> dict[str, str]:
+    """Return names of MeasurementSets without their folders, as far as these do not tell them apart, and not too long."""
+    last = {name: Path(name).name for name in names}
+    if len(set(last.values())) < len(last):
+        last = {name: "/".join(Path(name).parts[-2:]) for name in names}
+    return {name: plain(text if len(text) <= LONGEST else f"{text[:10]}…{text[11 - LONGEST:]}")
+            for name, text in last.items()}
+
+
 def _steps(record, end):
     """Return iterations and bounds (n, blocks), continued to the last iteration."""
     x = [entry["iteration"] for entry in record["bounds"]]
@@ -112,16 +123,17 @@ def block_noise(path, product) -> bool:
     if not blocks:
         return False
     colours = _colours(blocks)
+    names = _short(colours)
     rows = -(-len(colours) // 4)
     columns = min(len(colours), 4)
-    figure, axes = new_figure(rows, columns, 3.6, sharey=True)
+    figure, axes = new_figure(rows, columns, 3.6, width=11.5, sharey=True)
     every = -(-len(blocks) // MOST_LABELS)
     for panel in axes.flat[len(colours) :]:
         panel.set_axis_off()
     for panel, (ms, colour) in zip(axes.flat, colours.items()):
         own = sorted((block for block in blocks if block["ms"] == ms), key=lambda block: block["start_mjd_s"])
         _noise_panel(panel, own, colour, every)
-        panel.set_title(f"{plain(ms)}\n{_date(own[0]['start_mjd_s'])}", **TEXT)
+        panel.set_title(f"{names[ms]}\n{_date(own[0]['start_mjd_s'])}", **TEXT)
     values = [block[name] for block in blocks for name in ("noise_found", "noise_measured")]
     if max(values) > 4 * min(values) > 0:
         axes[0, 0].set_yscale("log")
@@ -136,22 +148,24 @@ def block_noise(path, product) -> bool:
 
 def _noise_panel(panel, blocks, colour, every) -> None:
     """Draw the blocks of one MeasurementSet."""
-    hours, cut = _hours(blocks)
+    times, cut = _hours(blocks)
+    unit = "hours" if times[-1] > 2 else "minutes"
+    times = times if unit == "hours" else 60 * times
     found = np.array([block["noise_found"] for block in blocks])
     measured = np.array([block["noise_measured"] for block in blocks])
     panel.axhline(1, color="0.6", lw=1, ls=":")
-    panel.vlines(hours, measured, found, color=colour, lw=1, alpha=0.5)
-    panel.plot(hours, measured, "o", mfc="white", mec="0.35", ms=5, label="measured: thermal")
-    panel.plot(hours, found, "o", color=colour, ms=5.5, label="found: with calibration errors")
-    for number, (x, y, block) in enumerate(zip(hours, np.maximum(found, measured), blocks)):
+    panel.vlines(times, measured, found, color=colour, lw=1, alpha=0.5)
+    panel.plot(times, measured, "o", mfc="white", mec="0.35", ms=5, label="measured: thermal")
+    panel.plot(times, found, "o", color=colour, ms=5.5, label="found: with calibration errors")
+    for number, (x, y, block) in enumerate(zip(times, np.maximum(found, measured), blocks)):
         if number % every == 0:
             scans = [str(scan) for scan in block["scans"]]
             text = scans[0] if len(scans) == 1 else f"{scans[0]}–{scans[-1]}" if scans else ""
             panel.annotate(plain(text), (x, y), xytext=(0, 6), textcoords="offset points", fontsize=8.5, rotation=90,
                            ha="center", va="bottom", color="0.25")
-    panel.set_xlabel("hours from start" + (", gaps cut" if cut else ""), **TEXT)
-    span = max(hours[-1] - hours[0], 0.1)
-    panel.set_xlim(hours[0] - 0.08 * span, hours[-1] + 0.08 * span)
+    span = max(times[-1] - times[0], 1e-3)
+    panel.set_xlim(times[0] - 0.08 * span, times[-1] + 0.08 * span)
+    panel.set_xlabel(f"{unit} from start" + (", gaps cut" if cut else ""), **TEXT)
 
 
 def _hours(blocks) -> tuple[np.ndarray, bool]:

@@ -50,24 +50,21 @@ def overview(path, comparison, weighting: str | None = None) -> None:
     """
     columns = _columns(comparison, weighting)
     norm, factor, unit = _brightness(comparison)
-    rows = ([("truth", comparison.truth, None)] if comparison.truth is not None else []) + [
-        (product.name, product.model, product) for product in comparison.products
-    ]
+    rows = _rows(comparison)
     nx, ny = comparison.products[0].model.shape
-    cell = comparison.cell_arcsec
+    cell, zooms = comparison.cell_arcsec, find_zooms(comparison)
     sheet = Sheet([row[0] for row in rows], columns, ny * cell[1] / (nx * cell[0]), celestial(comparison))
     noise, per_beam, noise_unit = _noise(comparison, weighting)
-    for row, (_, model, product) in enumerate(rows):
-        for column, kind in enumerate(columns):
-            image = _image(comparison, model, product, kind, weighting)
-            if image is None:
-                continue
-            panel = sheet.panel(row, column)
-            residual = kind == "residual"
-            draw(panel, image * (per_beam if residual else factor), noise if residual else norm, cell,
+    for column, kind in enumerate(columns):
+        images = [_image(comparison, model, product, kind, weighting) for _, model, product in rows]
+        there = [row for row, image in enumerate(images) if image is not None]
+        residual = kind == "residual"
+        for row in there:
+            panel = sheet.panel(row, column, row == there[-1])
+            draw(panel, images[row] * (per_beam if residual else factor), noise if residual else norm, cell,
                  DIFFERENCE_MAP if residual else BRIGHTNESS_MAP)
             if kind == "model":
-                for zoom in find_zooms(comparison):
+                for zoom in zooms:
                     outline(panel, zoom.box)
             else:
                 draw_beam(panel, comparison.beams[weighting], cell, "black" if residual else "white")
@@ -88,12 +85,10 @@ def zoomed(path, comparison) -> bool:
         x0, x1, y0, y1 = zoom.box
         centre = SkyCoord(*wcs.wcs_pix2world((x0 + x1 - 1) / 2, (y0 + y1 - 1) / 2, 0), unit="deg")
         columns.append(centre.to_string("hmsdms", precision=1, format="unicode"))
-    rows = ([("truth", comparison.truth)] if comparison.truth is not None else []) + [
-        (product.name, product.model) for product in comparison.products
-    ]
+    rows = _rows(comparison)
     norm, factor, unit = _brightness(comparison)
     sheet = Sheet([row[0] for row in rows], columns, 1.0, widest=2.75)
-    for row, (_, model) in enumerate(rows):
+    for row, (_, model, _) in enumerate(rows):
         for column, zoom in enumerate(zooms):
             panel = sheet.panel(row, column)
             draw(panel, model / np.prod(cell) * factor, norm, cell)
@@ -138,6 +133,12 @@ def differences(path, comparison) -> bool:
         sheet.bar(column, column, norm, DIFFERENCE_MAP, f"{sign}Jy arcsec$^{{-2}}$")
     sheet.save(path)
     return True
+
+
+def _rows(comparison) -> list[tuple]:
+    """Return (name, model, product or None) of the truth and of every product."""
+    found = [(product.name, product.model, product) for product in comparison.products]
+    return found if comparison.truth is None else [("truth", comparison.truth, None), *found]
 
 
 def _columns(comparison, weighting) -> list[str]:

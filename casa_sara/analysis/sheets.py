@@ -110,15 +110,16 @@ class Sheet:
         wide, high = self.size
         return self.figure.add_axes([left / wide, 1 - (top + height) / high, width / wide, height / high], **options)
 
-    def panel(self, row: int, column: int):
-        """Return new axes; labelled along the left and lower edges of the sheet only."""
+    def panel(self, row: int, column: int, lowest: bool | None = None):
+        """Return new axes; labelled along the left edge of the sheet and below the lowest panel of a column."""
+        lowest = row == len(self.rows) - 1 if lowest is None else lowest
         left, top = self.left + column * (self.side + GAP), TOP + row * self.step + HEADING
         options = {"projection": self.wcs} if self.wcs else {}
         axes = self._axes(left, top, self.side, self.side * self.aspect, **options)
         if not self.wcs:
             axes.set(xticks=[], yticks=[])
             return axes
-        for axis, name, shown in zip(axes.coords, ("RA", "Dec"), (row == len(self.rows) - 1, column == 0)):
+        for axis, name, shown in zip(axes.coords, ("RA", "Dec"), (lowest, column == 0)):
             axis.set_auto_axislabel(False)
             axis.set_ticklabel_visible(shown)
             axis.set_ticklabel(size=8.5, exclude_overlapping=True)

@@ -45,12 +45,12 @@ def _around_region(name, mask, cell) -> Zoom:
 
 
 def _around_peaks(comparison, most) -> list[Zoom]:
-    """Take the highest peaks, no two of them within one box."""
+    """Take the highest peaks, so far apart that their boxes do not overlap."""
     image = np.nan_to_num(reference(comparison))
     cell, shape = comparison.cell_arcsec, image.shape
     side = max(0.12 * max(shape[0] * cell[0], shape[1] * cell[1]), SMALLEST * max(cell))
     softened = gaussian_filter(image, 1.0)  # two pixels that share a source make one peak
-    highest = maximum_filter(softened, [max(int(round(side / width)), 3) for width in cell])
+    highest = maximum_filter(softened, [2 * max(int(np.ceil(side / width)), 2) + 1 for width in cell])
     peaks = np.argwhere((softened == highest) & (softened > FAINTEST * softened.max()))
     peaks = sorted(peaks, key=lambda peak: -softened[tuple(peak)])[:most]
     return [Zoom(f"peak {number}", _box(*peak, side, cell, shape)) for number, peak in enumerate(peaks, 1)]
