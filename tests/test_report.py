@@ -8,13 +8,14 @@ import subprocess
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from PIL import Image
 from synthetic_comparison import BEAMS, CELL, SHAPE, comparison, measures, record
 
 from casa_sara.analysis import animation, convergence, diagnostics, pages, zooms
 from casa_sara.analysis.comparison import Product
 from casa_sara.analysis.report import write_report
-from casa_sara.analysis.sheets import celestial
+from casa_sara.analysis.sheets import celestial, draw_beam
 from casa_sara.analysis.tables import as_text, number, tables
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
@@ -172,6 +173,36 @@ def test_axes_put_north_up_and_east_left(full):
     assert (north[1] - centre[1]) * scale == pytest.approx(1, rel=1e-6)
 
 
+@pytest.mark.parametrize("cell", [(0.1, 0.1), (0.1, 0.2)])
+def test_beam_is_turned_from_north_through_east(cell):
+    axes = Figure().subplots()
+    axes.set(xlim=(-0.5, 99.5), ylim=(-0.5, 99.5))
+    draw_beam(axes, (2.0, 0.5, 30.0), cell)
+    (ellipse,) = axes.patches
+    (outline,) = ellipse.get_transform().transform_path(ellipse.get_path()).to_polygons()
+    outline = axes.transData.inverted().transform(outline)
+    middle = (outline.max(axis=0) + outline.min(axis=0)) / 2
+    outline = (outline - middle) * cell * (-1, 1)  # to the east and to the north, in arcsec
+    tip = outline[np.argmax(outline @ (0.5, 0.866))]
+    np.testing.assert_allclose(tip, (np.sin(np.pi / 6), np.cos(np.pi / 6)), atol=0.03)
+    assert np.hypot(*outline.T).max() == pytest.approx(1, rel=0.02)
+    assert np.hypot(*outline.T).min() == pytest.approx(0.25, rel=0.02)
+
+
+@pytest.mark.parametrize("cell", [(0.1, 0.1), (0.1, 0.2)])
+def test_models_are_smoothed_with_the_beam_on_the_sky(full, cell):
+    """Second moments of a smoothed point, in arcsec, are those of the beam."""
+    point = np.zeros((96, 96))
+    point[48, 48] = 1.0
+    made = dataclasses.replace(full, cell_arcsec=cell, beams={"briggs": (2.0, 1.0, 30.0)})
+    image = pages.smoothed(made, point, "briggs")
+    east, north = (48 - np.arange(96))[:, None] * cell[0], (np.arange(96) - 48)[None, :] * cell[1]
+    sin, cos = 0.5, np.sqrt(0.75)
+    assert image.sum() == pytest.approx(1)
+    for along, fwhm in ((east * sin + north * cos, 2.0), (east * cos - north * sin, 1.0)):
+        assert np.sqrt(8 * np.log(2) * np.sum(image * along**2)) == pytest.approx(fwhm, rel=1e-3)
+
+
 def test_zooms_are_around_regions_or_peaks(full):
     found = {zoom.name: zoom.box for zoom in zooms.find_zooms(full)}
     assert list(found) == ["core", "lobe"]
@@ -192,6 +223,17 @@ def test_spectrum_of_white_noise_and_of_a_point():
     frequency, power = diagnostics.radial_spectrum(point, (0.1, 0.2))
     np.testing.assert_allclose(power, 4.0)
     assert frequency[-1] == pytest.approx(0.5 / np.deg2rad(0.2 / 3600), rel=0.1)
+
+
+@pytest.mark.parametrize("shape", [(24, 20), (25, 21)])
+def test_spectrum_is_the_mean_over_rings(shape):
+    image = np.random.default_rng(2).standard_normal(shape)
+    frequency, power = diagnostics.radial_spectrum(image, (0.1, 0.1))
+    full = np.abs(np.fft.fft2(image)) ** 2
+    radius = np.hypot(*np.meshgrid(*(np.fft.fftfreq(n, np.deg2rad(0.1 / 3600)) for n in shape), indexing="ij"))
+    for ring in (0, 1, 4, 9):
+        inside = np.abs(radius / frequency[1] - ring) < 0.5
+        assert power[ring] == pytest.approx(full[inside].mean())
 
 
 def test_spectrum_is_at_the_frequency_of_a_wave():
@@ -220,7 +262,7 @@ def test_table_as_text(full):
     assert len(titles) == 6 and all(title in text for title in titles)
     assert "note: one sample was wild & left out" in text
     flux = full.measures["products"]["tsara"]["flux_jy"]
-    assert re.search(rf"^ +flux .*\n +mJy .*\n  tsara +{1e3 * flux:.1f} ", text, re.MULTILINE)
+    assert re.search(rf"^ +flux .*\n +Jy .*\n  tsara +{flux:.4f} ", text, re.MULTILINE)
     for table in tables(full):
         assert {len(row) for row in (table.heads, table.units, *table.rows)} == {len(table.heads)}
     widths = [len(line.rstrip()) for line in text.split("\n\n")[0].splitlines()[1:2] + text.splitlines()[3:6]]
@@ -236,12 +278,28 @@ def test_numbers(value, text):
     assert number(value) == text
 
 
+def test_units_and_decimals_follow_the_numbers(full):
+    """One prefix for one unit of a table; as many decimals as the error has."""
+    sigmas = {"one": 2e-4, "two": 8.5e-4}
+    measured = {"products": {
+        name: {"natural": {"sigma": sigma, "peak": 0.5, "dr": 0.5 / sigma},
+               "regions": {"core": {"flux_jy": 12.3456, "error_jy": 0.0321}, "lobe": {"flux_jy": 1.0}}}
+        for name, sigma in sigmas.items()
+    }}  # fmt: skip
+    products = tuple(Product(name, np.ones(SHAPE)) for name in sigmas)
+    residuals, regions = tables(dataclasses.replace(full, products=products, measures=measured))
+    assert residuals.units == ("", "mJy/beam", "mJy/beam", "")
+    assert residuals.rows == (("one", "0.2000", "500.0", "2,500"), ("two", "0.8500", "500.0", "588"))
+    assert regions.rows == (("core", *["12.346 ± 0.032"] * 2), ("lobe", *["1.000"] * 2))
+
+
 def test_what_was_not_measured_is_left_out(full):
     measured = {"products": {"tsara": {"flux_jy": 1.0}, "tclean briggs": {"flux_jy": 2.0, "mdr": float("inf")}},
                 "similarity": {"natural": {"tsara|tclean briggs": float("inf")}}}
     made = tables(dataclasses.replace(full, measures=measured))
     assert [table.title for table in made] == ["Models", "Similarity"]
     assert made[0].rows == (("tsara", "1.000", "–"), ("tclean briggs", "2.000", "∞"))
+    assert made[0].units == ("", "Jy", "")
     assert made[1].rows == (("tsara and tclean briggs", "∞"),)
 
 

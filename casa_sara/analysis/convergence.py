@@ -98,7 +98,7 @@ def _colours(blocks) -> dict[str, str]:
 
 
 def _short(names) -> dict[str, str]:
-    """Return names of MeasurementSets without their folders, as far as these do not tell them apart, and not too long."""
+    """Return names of MeasurementSets without folders, unless these tell them apart, and not too long."""
     last = {name: Path(name).name for name in names}
     if len(set(last.values())) < len(last):
         last = {name: "/".join(Path(name).parts[-2:]) for name in names}

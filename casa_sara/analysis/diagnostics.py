@@ -18,7 +18,8 @@ REACH = 8.0  # of a histogram, in standard deviations
 
 def new_figure(rows: int, columns: int, height: float, width: float = 7.0, **options):
     """Return a figure, 11.5 inches wide at most, and its axes (rows, columns); `height` inches for each row."""
-    figure = Figure(figsize=(min(11.5, width * columns), rows * height), dpi=DPI, facecolor="white", layout="constrained")
+    size = min(11.5, width * columns), rows * height
+    figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **options)
     for panel in axes.flat:
         panel.tick_params(labelsize=SMALL)
@@ -138,6 +139,7 @@ def histograms(path, comparison) -> bool:
     figure, axes = new_figure(1, len(weightings), 4.0, sharey=True)
     edges = np.linspace(-REACH, REACH, 81)
     middle, width = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]
+    room = 2 * 10 ** (0.4 * len(comparison.products) + 0.4)  # for the legend
     for panel, weighting in zip(axes[0], weightings):
         smallest = np.inf
         for number, product in enumerate(comparison.products):
@@ -152,7 +154,7 @@ def histograms(path, comparison) -> bool:
             panel.stairs(np.where(counts > 0, counts, np.nan), edges, lw=1.6, label=label, **line(number))
         panel.plot(middle, np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi), color="0.25", ls="--", lw=1.2,
                    label="Gaussian")
-        panel.set(yscale="log", xlim=(-REACH, REACH), ylim=(min(smallest, 1e-3) / 2, 2 * 10 ** (0.4 * len(comparison.products) + 0.4)))
+        panel.set(yscale="log", xlim=(-REACH, REACH), ylim=(min(smallest, 1e-3) / 2, room))
         panel.set_xlabel("residual / its standard deviation σ", **TEXT)
         panel.set_title(f"residuals, {weighting}", **TEXT)
         panel.legend(fontsize=SMALL, frameon=False, loc="upper left")

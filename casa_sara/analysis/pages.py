@@ -33,9 +33,16 @@ PERCENTILE = 99.8  # of the differences, at the ends of their scale
 
 def smoothed(comparison, image, weighting: str) -> np.ndarray:
     """Return an image in Jy/pixel convolved with the CLEAN beam of a weighting, still in Jy/pixel."""
-    major, minor, angle = comparison.beams[weighting]
-    cell = np.sqrt(np.prod(comparison.cell_arcsec))
-    return metrics.smooth(np.nan_to_num(image), (major / cell, minor / cell), angle)
+    major, minor, angle = _in_pixels(comparison.beams[weighting], comparison.cell_arcsec)
+    return metrics.smooth(np.nan_to_num(image), (major, minor), angle)
+
+
+def _in_pixels(beam, cell) -> tuple[float, float, float]:
+    """Return major and minor axis in pixels, and position angle on a grid drawn with square pixels."""
+    sin, cos = np.sin(np.deg2rad(beam[2])), np.cos(np.deg2rad(beam[2]))
+    axes = np.array([[beam[0] * sin, beam[1] * cos], [beam[0] * cos, -beam[1] * sin]]) / np.reshape(cell, (2, 1))
+    squares, directions = np.linalg.eigh(axes @ axes.T)  # rows: east, north
+    return float(np.sqrt(squares[1])), float(np.sqrt(squares[0])), float(np.rad2deg(np.arctan2(*directions[:, 1])))
 
 
 def overview(path, comparison, weighting: str | None = None) -> None:

@@ -124,8 +124,8 @@ def _residuals(comparison, folder) -> list[Picture]:
         caption += "Where a model falls off, it resolves no further."
     else:
         caption += (
-            "Where a model falls below the truth, it resolves no further; what it has above the truth is made up: noise, "
-            "or flux put into too few pixels."
+            "Where a model falls below the truth, it resolves no further; what it has above the truth is made up: "
+            "noise, or flux put into too few pixels."
         )
     if comparison.beams:
         caption += " Vertical lines: one over the width of the CLEAN beam (dash-dotted: natural)."
@@ -139,8 +139,8 @@ def _residuals(comparison, folder) -> list[Picture]:
     path = folder / "histograms.png"
     if diagnostics.histograms(path, comparison):
         made.append(Picture(path, "residuals", "Histograms of the residuals", "Noise follows the Gaussian. Wings: "
-                            "emission left unmodelled, or artefacts (pixels beyond the ends are in the last bin). Steeper "
-                            "flanks than its: noise was put into the model."))
+                            "emission left unmodelled, or artefacts (pixels beyond the ends are in the last bin). "
+                            "Steeper flanks than its: noise was put into the model."))
     return made
 
 

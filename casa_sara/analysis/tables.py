@@ -67,19 +67,29 @@ def _build(title, columns, measured, caption="") -> Table | None:
     columns = [column for column in columns if any(column[0] in entry for entry in measured.values())]
     if not columns:
         return None
-    units, texts = zip(*(_column([entry.get(key) for entry in measured.values()], unit) for key, _, unit in columns))
+    values = [[entry.get(key) for entry in measured.values()] for key, _, _ in columns]
+    scales = {unit: _scale([column for column, (_, _, its) in zip(values, columns) if its == unit])
+              for _, _, unit in columns if unit.startswith("Jy")}
+    units, texts = zip(*(_column(column, unit, scales) for column, (_, _, unit) in zip(values, columns)))
     rows = tuple((name, *cells) for name, *cells in zip(measured, *texts))
     return Table(title, ("", *(head for _, head, _ in columns)), ("", *units), rows, caption)
 
 
-def _column(values, unit) -> tuple[str, list[str]]:
+def _scale(columns) -> tuple[float, str]:
+    """Return factor and prefix for columns of one unit; the fainter ones may be below 1."""
+    peaks = [max((abs(value) for value in column if _is_number(value)), default=0) for column in columns]
+    peaks = [peak for peak in peaks if peak > 0]
+    return prefix(10 * min(peaks)) if peaks else (1.0, "")
+
+
+def _column(values, unit, scales) -> tuple[str, list[str]]:
     """Return the unit of a column and its numbers in that unit, with one number of decimals where that says enough."""
+    factor, sign = scales.get(unit, (1.0, ""))
     finite = [abs(float(value)) for value in values if _is_number(value) and value != 0]
     if not finite:
-        return unit, [number(value) for value in values]
+        return sign + unit, [number(value) for value in values]
     if unit == "dB":
         return unit, [_fixed(value, 1) for value in values]
-    factor, sign = prefix(max(finite)) if unit.startswith("Jy") else (1.0, "")
     values = [value * factor if _is_number(value) else value for value in values]
     largest, least = max(finite) * factor, min(finite) * factor
     decimals = max(3 - int(np.floor(np.log10(largest))), 0)
@@ -153,13 +163,18 @@ def _regions(measured):
         cells = []
         for entry in measured.values():
             found = entry.get("regions", {}).get(name, {})
-            cell = number(found.get("flux_jy"))
-            if found.get("error_jy") is not None:
-                cell += f" ± {number(found['error_jy'], 2)}"
-            cells.append(cell)
+            cells.append(_with_error(found.get("flux_jy"), found.get("error_jy")))
         rows.append((name, *cells))
     caption = "Flux within each region; the error, where there is one, is that of the noise of the restored image."
     return Table("Regions", ("", *measured), ("", *["Jy"] * len(measured)), tuple(rows), caption)
+
+
+def _with_error(value, error) -> str:
+    """Return a value and its error with two significant digits of the error."""
+    if not (_is_number(value) and _is_number(error) and error > 0):
+        return number(value)
+    decimals = max(1 - int(np.floor(np.log10(error))), 0)
+    return f"{_fixed(value, decimals)} ± {_fixed(error, decimals)}"
 
 
 def _truth(measured):
