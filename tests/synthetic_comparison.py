@@ -77,7 +77,8 @@ def measures(products, sky, regions):
         entry = {
             "flux_jy": float(made.model.sum()), "peak_jy_per_pixel": float(made.model.max()),
             "negative_jy": float(made.model.clip(max=0).sum()), "mdr": 1234.5, "fwhm_recovered_arcsec": 0.21,
-            "regions": {name: {"flux_jy": float(made.model[mask].sum()), "error_jy": 1.3e-3}
+            "regions": {name: {"flux_jy": float(made.model[mask].sum()), "error_jy": 1.3e-3,
+                                   "model_flux_jy": float(made.model[mask].sum())}
                         for name, mask in regions.items()},
         }  # fmt: skip
         for weighting, residual in made.residual.items():

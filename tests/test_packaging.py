@@ -49,7 +49,10 @@ ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
 ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.jsonfile", "numpy", *NUMERICS}
-ROOMS["demo"] = {"casa_sara", "casa_sara.casa", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS, *CASA}
+ROOMS["demo"] = {
+    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS,
+    *CASA,
+}
 
 
 def imports(module):

@@ -347,3 +347,12 @@ def test_wild_samples_are_left_out_named_and_counted(run, copy, tmp_path):
     residual, before = (_pixels(name + ".residual") for name in (str(tmp_path / "wild"), run[1]))
     assert residual.std() < 1.1 * before.std()
     assert sum(block["samples"] for block in sara["blocks"]) == run[0]["sara"]["visibilities"] - 2 == sara["visibilities"]
+
+
+def test_a_report_of_the_run(vis, tmp_path):
+    name = tmp_path / "run"
+    tsara(vis=vis, imagename=str(name), report=True, niter=40, **GRID)
+    page = (tmp_path / "run.report" / "report.html").read_text()
+    assert all(words in page for words in ("natural weighting", "briggs weighting", "Convergence", "c.ms"))
+    with pytest.raises(FileExistsError, match="run.report"):
+        tsara(vis=vis, imagename=str(name), report=True, niter=40, **GRID)

@@ -40,6 +40,13 @@ def number(value, digits: int = 4) -> str:
     return f"{value:,.{decimals}f}".replace("-", "−")
 
 
+REGION_TABLES = (
+    ("model_flux_jy", "Regions, flux of the models", "Sum of the model within each region."),
+    ("flux_jy", "Regions, flux of the restored images",
+     "Within each region; a region smaller than the beam holds a part of its source. The error is that of the noise."),
+)
+
+
 def tables(comparison) -> list[Table]:
     """Return the tables for which there are measures.
 
@@ -50,8 +57,9 @@ def tables(comparison) -> list[Table]:
     measured = comparison.measures.get("products", {})
     names = [product.name for product in comparison.products if product.name in measured]
     measured = {name: measured[name] for name in names}
-    made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS), _regions(measured),
-            _truth(measured), _similarity(comparison.measures.get("similarity", {}))]
+    made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS),
+            *(_regions(measured, *of) for of in REGION_TABLES), _truth(measured),
+            _similarity(comparison.measures.get("similarity", {}))]
     return [table for table in made if table is not None]
 
 
@@ -118,7 +126,7 @@ def _models(measured):
     ]
     caption = (
         "MDR: peak of the model over the brightest pixel outside of the source. Width of a point: full width at half "
-        "maximum of a point source added to the data, as it was recovered."
+        "maximum, in the model, of the brightest unresolved source that stands alone in the truth."
     )
     return _build("Models", columns, measured, caption)
 
@@ -154,19 +162,21 @@ def _flat(entry):
     return {**entry, "chi_square": text}
 
 
-def _regions(measured):
-    names = list(dict.fromkeys(name for entry in measured.values() for name in entry.get("regions", {})))
-    if not names:
+def _regions(measured, key, title, caption):
+    """Flux in every region; `key` is that of the models, or of the restored images with its error."""
+    found = {
+        name: {region: entry for region, entry in one.get("regions", {}).items() if key in entry}
+        for name, one in measured.items()
+    }
+    regions = list(dict.fromkeys(region for entries in found.values() for region in entries))
+    if not regions:
         return None
     rows = []
-    for name in names:
-        cells = []
-        for entry in measured.values():
-            found = entry.get("regions", {}).get(name, {})
-            cells.append(_with_error(found.get("flux_jy"), found.get("error_jy")))
-        rows.append((name, *cells))
-    caption = "Flux within each region; the error, where there is one, is that of the noise of the restored image."
-    return Table("Regions", ("", *measured), ("", *["Jy"] * len(measured)), tuple(rows), caption)
+    for region in regions:
+        entries = [one.get(region, {}) for one in found.values()]
+        error = "error_jy" if key == "flux_jy" else ""
+        rows.append((region, *(_with_error(entry.get(key), entry.get(error)) for entry in entries)))
+    return Table(title, ("", *measured), ("", *["Jy"] * len(measured)), tuple(rows), caption)
 
 
 def _with_error(value, error) -> str:

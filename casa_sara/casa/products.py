@@ -15,17 +15,17 @@ from casa_sara.casa.restore import restore
 from casa_sara.casa.tools import opened
 
 __all__ = [
-    "RECORD", "check_imagename", "existing_products", "history_lines", "new_products", "remove_products",
+    "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products", "remove_products",
     "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-RECORD = ".sara.json"  # written last, by the task
+RECORD, REPORT = ".sara.json", ".report"  # written last, by the task; the report is a folder
 
 
 def existing_products(imagename):
     """Return the paths of the products that stand under this name."""
-    return [imagename + suffix for suffix in (*PRODUCTS, RECORD) if os.path.lexists(imagename + suffix)]
+    return [imagename + suffix for suffix in (*PRODUCTS, RECORD, REPORT) if os.path.lexists(imagename + suffix)]
 
 
 def remove_products(imagename):

@@ -9,7 +9,7 @@ from casatools import image
 
 from casa_sara.analysis import metrics
 from casa_sara.analysis.plots import Column, Zoom, compare
-from casa_sara.demo.imagers import Case, Product, quiet, run_tcleans, run_tsara
+from casa_sara.demo.imagers import Case, Product, quiet, run_tcleans, run_tsara, write_comparison
 from casa_sara.demo.simulate import Simulation, simulate_observation
 from casa_sara.demo.sky import COMPANION_JY, CORE_JY, cyg_a_like
 
@@ -17,6 +17,10 @@ __all__ = ["run"]
 
 NOISE_DB = 35.0
 GAIN_RMS = 0.01
+REGIONS = (
+    "core = 19h59m28.356s 40d44m02.10s 0.25arcsec", "companion = 19h59m28.327s 40d44m01.874s 0.12arcsec",
+    "western hotspots = 19h59m27.39s 40d44m05.4s 1.6arcsec",
+)
 SEED = 1
 # the best SNR of a grid over scales, bias, gain and mask, for each weighting; more iterations do not raise it
 COMMON = {"gain": 0.2, "niter": 4000, "nsigma": 2.0}
@@ -43,6 +47,8 @@ def run(folder: Path) -> None:
     write_truth(simulation, folder)
     print("\n" + table(simulation.truth, products, simulation.cell_arcsec))
     picture(folder / "cyga.png", simulation, products, samples)
+    text, page = write_comparison(case, str(folder / "truth.model"), REGIONS)
+    print(f"\n{text}\n\n  report: {page}")
 
 
 def table(truth: np.ndarray, products: list[Product], cell_arcsec: float) -> str:

@@ -16,7 +16,7 @@ from casatools import image
 
 from casa_sara import tsara
 
-__all__ = ["Case", "Product", "run_tsara", "run_tcleans", "read_image", "quiet"]
+__all__ = ["Case", "Product", "run_tsara", "run_tcleans", "read_image", "quiet", "write_comparison"]
 
 TCLEAN_WEIGHTINGS = {"tclean Briggs −1": ("briggs", -1.0), "tclean natural": ("natural", 0.0)}
 
@@ -79,6 +79,21 @@ def run_tcleans(case: Case) -> list[Product]:
         if threads is not None:
             os.environ["OMP_NUM_THREADS"] = threads
     return [_product(name, *result) for name, result in zip(TCLEAN_WEIGHTINGS, made)]
+
+
+def write_comparison(case: Case, truth: str = "", regions: tuple[str, ...] = ()) -> tuple[str, Path]:
+    """Compare the three products of a case as the task saracompare does; return its tables as text, and the report."""
+    from casa_sara.analysis.report import write_report
+    from casa_sara.analysis.tables import as_text
+    from casa_sara.compare import compare_images
+    from casa_sara.options import Comparing, Selection
+
+    roots = tuple(str(case.folder / name) for name in ("tsara", "tclean_briggs", "tclean_natural"))
+    request = Comparing(roots, ("tsara", *TCLEAN_WEIGHTINGS), truth, regions)
+    with quiet(case.folder / "comparison.txt"):
+        comparison = compare_images(request, Selection(tuple(case.vis), datacolumn="data"))
+        page = write_report(comparison, case.folder / "report", f"tsara beside tclean: {case.folder.name}")
+    return as_text(comparison), page
 
 
 def _tclean(case: Case, weighting: tuple[str, float]) -> tuple[Path, int, float, float]:

@@ -10,7 +10,7 @@ from casatools import ctsys
 from casa_sara.analysis import metrics
 from casa_sara.analysis.plots import Column, Zoom, compare
 from casa_sara.demo.cyga import layout
-from casa_sara.demo.imagers import Case, Product, quiet, run_tcleans, run_tsara
+from casa_sara.demo.imagers import Case, Product, quiet, run_tcleans, run_tsara, write_comparison
 
 __all__ = ["run"]
 
@@ -37,6 +37,8 @@ def run(folder: Path) -> None:
     products = [run_tsara(case), *cleaned]
     print("\n" + table(products))
     picture(folder / "3c273.png", products)
+    text, page = write_comparison(case)
+    print(f"\n{text}\n\n  report: {page}")
 
 
 def table(products: list[Product]) -> str:

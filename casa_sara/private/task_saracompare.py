@@ -75,8 +75,6 @@ def _words(value):
 
 def _report(comparison: Comparison, folder: Path) -> None:
     """Write the report and its pictures."""
-    try:  # merged later
-        from casa_sara.analysis.report import write_report
-    except ImportError:
-        return
+    from casa_sara.analysis.report import write_report  # matplotlib takes its time
+
     write_report(comparison, folder)

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import casa_sara
 from casa_sara import jsonfile
 from casa_sara.casa import log
 from casa_sara.casa.modelcolumn import check_model_column_writable
-from casa_sara.casa.products import RECORD, check_imagename, existing_products, history_lines
+from casa_sara.casa.products import RECORD, REPORT, check_imagename, existing_products, history_lines
 from casa_sara.casa.quantities import radians
 from casa_sara.casa.restore import restoring_beam_words
 from casa_sara.imaging import make_image
-from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import Comparing, ImageGrid, Output, Selection, SolverOptions, Weighting
 from casa_sara.private.summary import summary
 from casa_sara.resources import available_cores
 
@@ -35,7 +36,19 @@ def tsara(**parameters: Any) -> dict[str, Any]:
         check_model_column_writable(selection)
     result = make_image(selection, grid, weighting, options, output)
     jsonfile.save(output.imagename + RECORD, summary(result, options, full=True)["sara"])
+    if parameters["report"]:
+        _report(output.imagename, selection, options.nthreads)
     return summary(result, options, parameters["fullsummary"])
+
+
+def _report(imagename, selection, nthreads):
+    """Write the report of one run beside its images."""
+    from casa_sara.analysis.report import write_report
+    from casa_sara.compare import compare_images
+
+    log.info("writing the report")
+    comparison = compare_images(Comparing((imagename,), nthreads=nthreads), selection, single=True)
+    write_report(comparison, Path(imagename + REPORT), f"tsara: {Path(imagename).name}")
 
 
 def selection_of(parameters: dict[str, Any]) -> Selection:

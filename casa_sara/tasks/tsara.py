@@ -50,6 +50,7 @@ PARAMETERS = (
     Parameter('blocks', ('int',), 0, 'Number of data blocks, each with its own bound; 0: one per snapshot', minimum=0.0),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0),
     Parameter('fullsummary', ('bool',), False, 'Return dictionary with complete convergence history'),
+    Parameter('report', ('bool',), False, 'Write a report of the run, imagename.report/report.html'),
     Parameter('restart', ('bool',), False, 'Continue from imagename.model'),
     Parameter('overwrite', ('bool',), False, 'Replace existing images'),
     Parameter('savemodel', ('string',), 'none', 'Options to save model visibilities (none, modelcolumn)', allowed=('none', 'modelcolumn')),
@@ -340,6 +341,11 @@ class _tsara:
         True returns every iteration in the record 'sara' of the returned dictionary; False the
         state at each re-weighting and at the end.
 
+    report : bool, default False
+        True writes a page with the images, residuals with natural and Briggs weights, convergence, the
+        noise found in every snapshot, and all numbers: imagename.report/report.html, and its pictures
+        beside it. The task saracompare writes the same for several images.
+
     restart : bool, default False
         True starts from the existing imagename.model and replaces the products; the model must
         have the shape and coordinates asked for. False starts afresh.
@@ -398,8 +404,8 @@ class _tsara:
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
         precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
         l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003,
-        regscale=1.0, blocks=0, nthreads=0, fullsummary=False, restart=False, overwrite=False, savemodel='none',
-        parallel=False,
+        regscale=1.0, blocks=0, nthreads=0, fullsummary=False, report=False, restart=False, overwrite=False,
+        savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())
