@@ -261,7 +261,7 @@ def test_animation_has_a_frame_for_each_image(tmp_path):
 def test_table_as_text(full):
     text = as_text(full)
     titles = [table.title for table in tables(full)]
-    assert len(titles) == 6 and all(title in text for title in titles)
+    assert len(titles) == 7 and all(title in text for title in titles)
     assert "note: one sample was wild & left out" in text
     flux = full.measures["products"]["tsara"]["flux_jy"]
     assert re.search(rf"^ +flux .*\n +Jy .*\n  tsara +{flux:.4f} ", text, re.MULTILINE)
