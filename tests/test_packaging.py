@@ -112,6 +112,12 @@ def test_changelog_tells_this_version():
 
 
 def test_package_is_complete():
-    """Every folder with modules is a package, or installing the project would leave it out."""
+    """Every folder with modules is a package and templates are named, or installing the project would leave them out."""
+    config = configparser.ConfigParser()
+    config.read(ROOT / "setup.cfg")
+    named = {PACKAGE.parent.joinpath(*package.split("."), pattern)
+             for package, pattern in config["options.package_data"].items()}
+    for path in PACKAGE.rglob("*.j2"):
+        assert any(path.match(str(pattern)) for pattern in named), path
     for module in MODULES:
         assert (PACKAGE / module).parent.joinpath("__init__.py").exists(), module

@@ -15,7 +15,7 @@ from synthetic_comparison import BEAMS, CELL, SHAPE, comparison, measures, recor
 from casa_sara.analysis import animation, convergence, diagnostics, pages, zooms
 from casa_sara.analysis.comparison import Product
 from casa_sara.analysis.report import write_report
-from casa_sara.analysis.sheets import celestial, draw_beam
+from casa_sara.analysis.sheets import celestial, draw_beam, plain
 from casa_sara.analysis.tables import as_text, number, tables
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
@@ -53,7 +53,8 @@ def full():
 
 @pytest.fixture(scope="module")
 def report(full, tmp_path_factory):
-    return write_report(full, tmp_path_factory.mktemp("report"), title="A test", frames=FRAMES)
+    return write_report(full, tmp_path_factory.mktemp("report"), title="A test", frames=FRAMES,
+                        zoom=(0.0, 0.0, 2.0))
 
 
 def pixels(path):
@@ -133,13 +134,15 @@ def test_parts_of_a_record(tmp_path, missing):
 
 
 def test_blank_pixels_and_zero_residuals(tmp_path):
-    made = comparison(names=("one", "two"))
+    made = comparison(names=("_one", "two"))
     model = made.products[0].model.copy()
     model[:5] = np.nan
     zero = {weighting: np.zeros(SHAPE) for weighting in BEAMS}
     products = (dataclasses.replace(made.products[0], model=model),
                 dataclasses.replace(made.products[1], residual=zero))
-    assert write_report(dataclasses.replace(made, products=products), tmp_path).exists()
+    made = dataclasses.replace(made, products=products)
+    assert write_report(made, tmp_path).exists()
+    assert write_report(dataclasses.replace(made, products=products[:1]), tmp_path / "hidden_label").exists()
 
 
 def test_pictures_differ_where_the_data_do(tmp_path, full):
@@ -293,6 +296,11 @@ def test_units_and_decimals_follow_the_numbers(full):
     assert residuals.units == ("", "mJy/beam", "mJy/beam", "")
     assert residuals.rows == (("one", "0.2000", "500.0", "2,500"), ("two", "0.8500", "500.0", "588"))
     assert regions.rows == (("core", *["12.346 ± 0.032"] * 2), ("lobe", *["1.000"] * 2))
+
+
+def test_names_are_printed_as_they_are():
+    """Matplotlib reads $…$ as mathematics and leaves labels that start with an underscore out of a legend."""
+    assert plain("_a $b$") == r" _a \$b\$" and plain("a_b") == "a_b"
 
 
 def test_what_was_not_measured_is_left_out(full):

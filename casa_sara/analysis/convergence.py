@@ -6,8 +6,9 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
+from matplotlib.lines import Line2D
 
-from casa_sara.analysis.diagnostics import SMALL, TEXT, new_figure
+from casa_sara.analysis.diagnostics import SMALL, TEXT, legend, new_figure
 from casa_sara.analysis.sheets import LINES, plain
 
 __all__ = ["block_noise", "convergence"]
@@ -141,7 +142,9 @@ def block_noise(path, product) -> bool:
         axes[0, 0].set_ylim(0, 1.35 * max(values))
     for panel in axes[:, 0]:
         panel.set_ylabel("noise, in units of the weights'", **TEXT)
-    axes[0, 0].legend(fontsize=SMALL, frameon=False, loc="lower left")
+    grey = {"ls": "", "marker": "o"}
+    legend(figure, [Line2D([], [], mfc="white", mec="0.35", ms=5, label="measured: thermal noise", **grey),
+                    Line2D([], [], color="0.35", ms=5.5, label="found: with calibration errors", **grey)])
     figure.savefig(path)
     return True
 
@@ -155,8 +158,8 @@ def _noise_panel(panel, blocks, colour, every) -> None:
     measured = np.array([block["noise_measured"] for block in blocks])
     panel.axhline(1, color="0.6", lw=1, ls=":")
     panel.vlines(times, measured, found, color=colour, lw=1, alpha=0.5)
-    panel.plot(times, measured, "o", mfc="white", mec="0.35", ms=5, label="measured: thermal")
-    panel.plot(times, found, "o", color=colour, ms=5.5, label="found: with calibration errors")
+    panel.plot(times, measured, "o", mfc="white", mec="0.35", ms=5)
+    panel.plot(times, found, "o", color=colour, ms=5.5)
     for number, (x, y, block) in enumerate(zip(times, np.maximum(found, measured), blocks)):
         if number % every == 0:
             scans = [str(scan) for scan in block["scans"]]

@@ -8,7 +8,7 @@ from scipy.signal.windows import tukey
 
 from casa_sara.analysis.sheets import DPI, line, plain
 
-__all__ = ["histograms", "new_figure", "radial_spectrum", "spectra"]
+__all__ = ["histograms", "legend", "new_figure", "radial_spectrum", "spectra"]
 
 ARCSEC = np.pi / 180 / 3600
 TEXT, SMALL = {"fontsize": 10.5}, 9.5
@@ -27,6 +27,14 @@ def new_figure(rows: int, columns: int, height: float, width: float = 7.0, **opt
         panel.set_axisbelow(True)
         panel.spines[["top", "right"]].set_visible(False)
     return figure, axes
+
+
+def legend(figure, handles) -> None:
+    """Put one legend for all panels below them; handles of one label appear once."""
+    unique = {handle.get_label(): handle for handle in handles}
+    columns = max(1, min(len(unique), 130 // (max(map(len, unique)) + 8)))
+    figure.legend(handles=list(unique.values()), loc="outside lower center", ncols=columns, fontsize=SMALL,
+                  frameon=False)
 
 
 def radial_spectrum(image, cell_arcsec, window: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -80,7 +88,7 @@ def spectra(path, comparison) -> bool:
     if not images:
         return False
     weightings = [w for w in WEIGHTINGS if any(_has_noise(product, w) for product in comparison.products)]
-    figure, axes = new_figure(1, 1 + len(weightings), 4.2)
+    figure, axes = new_figure(1, 1 + len(weightings), 4.4)
     _model_spectra(axes[0, 0], images, comparison.cell_arcsec)
     for panel, weighting in zip(axes[0, 1:], weightings):
         _residual_spectra(panel, comparison, weighting)
@@ -91,7 +99,7 @@ def spectra(path, comparison) -> bool:
         panel.set(xscale="log", yscale="log")
         panel.set_xlabel("spatial frequency [kλ]", **TEXT)
         panel.yaxis.label.set_size(10.5)
-        panel.legend(fontsize=SMALL, frameon=False, loc="lower left")
+    legend(figure, [handle for panel in axes.flat for handle in panel.get_legend_handles_labels()[0]])
     figure.savefig(path)
     return True
 
@@ -136,10 +144,9 @@ def histograms(path, comparison) -> bool:
     weightings = [w for w in WEIGHTINGS if any(_has_noise(product, w) for product in comparison.products)]
     if not weightings:
         return False
-    figure, axes = new_figure(1, len(weightings), 4.0, sharey=True)
+    figure, axes = new_figure(1, len(weightings), 4.2, sharey=True)
     edges = np.linspace(-REACH, REACH, 81)
     middle, width = (edges[1:] + edges[:-1]) / 2, edges[1] - edges[0]
-    room = 2 * 10 ** (0.4 * len(comparison.products) + 0.4)  # for the legend
     for panel, weighting in zip(axes[0], weightings):
         smallest = np.inf
         for number, product in enumerate(comparison.products):
@@ -150,14 +157,14 @@ def histograms(path, comparison) -> bool:
             scaled = (values - values.mean()) / values.std()
             counts = np.histogram(np.clip(scaled, -REACH, REACH), edges)[0] / (width * values.size)
             smallest = min(smallest, 1 / (width * values.size))
-            label = f"{plain(product.name)}, extreme {np.abs(scaled).max():.1f} σ"
-            panel.stairs(np.where(counts > 0, counts, np.nan), edges, lw=1.6, label=label, **line(number))
+            panel.stairs(np.where(counts > 0, counts, np.nan), edges, lw=1.6, label=plain(product.name),
+                         **line(number))
         panel.plot(middle, np.exp(-(middle**2) / 2) / np.sqrt(2 * np.pi), color="0.25", ls="--", lw=1.2,
                    label="Gaussian")
-        panel.set(yscale="log", xlim=(-REACH, REACH), ylim=(min(smallest, 1e-3) / 2, room))
+        panel.set(yscale="log", xlim=(-REACH, REACH), ylim=(min(smallest, 1e-3) / 2, 4))
         panel.set_xlabel("residual / its standard deviation σ", **TEXT)
         panel.set_title(f"residuals, {weighting}", **TEXT)
-        panel.legend(fontsize=SMALL, frameon=False, loc="upper left")
+    legend(figure, [handle for panel in axes.flat for handle in panel.get_legend_handles_labels()[0]])
     axes[0, 0].set_ylabel("density of pixels", **TEXT)
     figure.savefig(path)
     return True

@@ -44,7 +44,8 @@ class Picture:
 
 
 def write_report(comparison: Comparison, folder: Path, title: str = "SARA imaging report",
-                 frames: Sequence[tuple[str, np.ndarray, float]] = ()) -> Path:
+                 frames: Sequence[tuple[str, np.ndarray, float]] = (),
+                 zoom: tuple[float, float, float] | None = None) -> Path:
     """Write the pictures of a comparison and report.html, which holds them all.
 
     Sections for which there is nothing are left out.
@@ -58,6 +59,8 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     title : str
     frames : sequence of (str, ndarray, float), optional
         Title, model in Jy/pixel and pixel size in arcsec of reconstructions with different pixels, to be animated.
+    zoom : (float, float, float), optional
+        The part of the frames that is shown: centre in arcsec to the east and to the north, and side in arcsec.
 
     Returns
     -------
@@ -66,7 +69,12 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    pictures = [*_sky(comparison, folder, frames), *_residuals(comparison, folder), *_runs(comparison, folder)]
+    pictures = [*_sky(comparison, folder)]
+    if frames:
+        animation.animate(folder / "cells.png", frames, zoom)
+        pictures.append(Picture(folder / "cells.png", "sky", "From coarse to fine pixels", "One part of the sky, imaged "
+                                "with different pixel sizes, on one logarithmic scale."))
+    pictures += [*_residuals(comparison, folder), *_runs(comparison, folder)]
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                   lstrip_blocks=True).get_template(TEMPLATE)
@@ -85,7 +93,7 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     return page
 
 
-def _sky(comparison, folder, frames) -> list[Picture]:
+def _sky(comparison, folder) -> list[Picture]:
     """Draw the pictures of the sky."""
     stretch = "One logarithmic scale for all that is per arcsec²" + (
         "; residuals have a scale of their own. Ellipses are the CLEAN beam." if comparison.beams else ".")
@@ -107,11 +115,6 @@ def _sky(comparison, folder, frames) -> list[Picture]:
         made.append(Picture(path, "sky", "Differences", f"Models minus that of {what}, as they are and smoothed with "
                             "each CLEAN beam. Red: more than there; blue: less. The scales are linear and end at the "
                             "99.8th percentile."))
-    if frames:
-        path = folder / "cells.png"
-        animation.animate(path, frames)
-        made.append(Picture(path, "sky", "From coarse to fine pixels", "One part of the sky, imaged with different "
-                            "pixel sizes, on one logarithmic scale."))
     return made
 
 

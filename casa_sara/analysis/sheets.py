@@ -35,8 +35,9 @@ def line(number: int) -> dict[str, str]:
 
 
 def plain(text) -> str:
-    """Return a text that matplotlib prints as it is: names may hold dollar signs."""
-    return str(text).replace("$", r"\$")
+    """Return a text that matplotlib prints as it is: names may hold dollar signs, or start with an underscore."""
+    text = str(text).replace("$", r"\$")
+    return f" {text}" if text.startswith("_") else text
 
 
 def prefix(value: float) -> tuple[float, str]:
@@ -89,7 +90,8 @@ class Sheet:
 
     def __post_init__(self):
         count, left = len(self.columns), LEFT if self.wcs else RIGHT
-        self.side = min((WIDEST - left - RIGHT - GAP * (count - 1)) / count, self.widest, 9 / self.aspect)
+        self.side = min((WIDEST - left - RIGHT - GAP * (count - 1)) / count, self.widest,
+                        max(4.0, 16 / len(self.rows)) / self.aspect)
         self.step = self.side * self.aspect + HEADING
         width = left + count * (self.side + GAP) - GAP + RIGHT
         self.bottom = BAR if self.wcs else BAR - 0.4
@@ -97,7 +99,8 @@ class Sheet:
         self.left = left + (self.size[0] - width) / 2
         self.figure = Figure(figsize=self.size, dpi=DPI, facecolor="white")
         for number, heading in enumerate(self.columns):
-            self._write(self.left + number * (self.side + GAP) + self.side / 2, 0.17, heading, ha="center")
+            self._write(self.left + number * (self.side + GAP) + self.side / 2, 0.17, heading, ha="center",
+                        fontsize=10.5 if self.side > 1.5 else 9)
         for number, heading in enumerate(self.rows):
             top = TOP + number * self.step + HEADING - 0.08
             self._write(self.left, top, heading, ha="left", va="baseline", fontweight="bold")
@@ -123,7 +126,7 @@ class Sheet:
             axis.set_auto_axislabel(False)
             axis.set_ticklabel_visible(shown)
             axis.set_ticklabel(size=8.5, exclude_overlapping=True)
-            axis.set_ticks(number=4 if self.side > 3 else 3)
+            axis.set_ticks(number=4 if self.side > 3 else 3 if self.side > 2 or name == "Dec" else 2)
             axis.tick_params(direction="in", color="0.7")
             if shown:
                 axis.set_axislabel(name, minpad=0.4 if name == "Dec" else 0.6, **TEXT)
