@@ -112,7 +112,7 @@ def test_changelog_tells_this_version():
 
 
 def test_package_is_complete():
-    """Every folder with modules is a package and templates are named, or installing the project would leave them out."""
+    """Folders with modules are packages and templates are named, or installing the project would leave them out."""
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
     named = {PACKAGE.parent.joinpath(*package.split("."), pattern)

@@ -72,8 +72,8 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     pictures = [*_sky(comparison, folder)]
     if frames:
         animation.animate(folder / "cells.png", frames, zoom)
-        pictures.append(Picture(folder / "cells.png", "sky", "From coarse to fine pixels", "One part of the sky, imaged "
-                                "with different pixel sizes, on one logarithmic scale."))
+        pictures.append(Picture(folder / "cells.png", "sky", "From coarse to fine pixels", "One part of the sky, "
+                                "imaged with different pixel sizes, on one logarithmic scale."))
     pictures += [*_residuals(comparison, folder), *_runs(comparison, folder)]
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
