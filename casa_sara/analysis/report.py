@@ -143,7 +143,7 @@ def _residuals(comparison, folder) -> list[Picture]:
     if diagnostics.histograms(path, comparison):
         made.append(Picture(path, "residuals", "Histograms of the residuals", "Noise follows the Gaussian. Wings: "
                             "emission left unmodelled, or artefacts (pixels beyond the ends are in the last bin). "
-                            "Steeper flanks than its: noise was put into the model."))
+                            "Flanks steeper than the Gaussian's: noise was put into the model."))
     return made
 
 
