@@ -28,7 +28,7 @@ __all__ = ["compare_images"]
 IMAGE_EPS = 1e-6  # accuracy of the residual images
 LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a word
 ARCSEC = np.radians(1 / 3600)
-RADESYS = {"J2000": "FK5", "ICRS": "ICRS"}
+RADESYS = {"J2000": "FK5", "ICRS": "ICRS", "B1950": "FK4", "B1950_VLA": "FK4"}
 VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
 
 
@@ -58,7 +58,9 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     sets = _read(request, selection is None, 1 if single else 2)
     first, notes = sets[0].model, []
     if first.plane.frame not in RADESYS:
-        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000 or ICRS")
+        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or B1950")
+    if RADESYS[first.plane.frame] == "FK4":
+        notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
     observed = _Observed(selection, first.plane, request, notes) if selection else None
     # one grid
     plane = observed.plane if observed else first.plane

@@ -176,7 +176,7 @@ def test_a_point_in_galactic_coordinates_is_found_again(tmp_path):
     found = saracompare(models=[one, two])
     assert found["products"]["two"]["flux_jy"] == pytest.approx(1.0, rel=1e-6)
     assert found["similarity"]["natural"]["one|two"] > 35
-    with pytest.raises(ValueError, match="models: '.*two.model' is in GALACTIC: the first should be in J2000 or ICRS"):
+    with pytest.raises(ValueError, match="models: '.*two.model' is in GALACTIC: the first should be in J2000, ICRS or B1950"):
         saracompare(models=[two, one])
 
 
@@ -509,3 +509,19 @@ def test_the_task_in_the_casa_shell(tmp_path):
     assert json.loads((tmp_path / "report/measures.json").read_text())["similarity"]["natural"]["a|b"] < 20
     assert refused["error"] == "FileExistsError"  # the report is there now
     assert "saracompare" in tasks["printed"]
+
+
+def test_regions_on_an_image_in_b1950():
+    """A circle in J2000 falls on its place in an image whose frame is B1950."""
+    from astropy import units
+    from astropy.coordinates import FK4, SkyCoord
+
+    from casa_sara.analysis.areas import Frame, region_masks
+
+    place = SkyCoord("12h29m06.7s", "+2d03m09s", frame="fk5")
+    old = place.transform_to(FK4(equinox="B1950"))
+    frame = Frame((old.ra.deg, old.dec.deg), (1.0, 1.0), (64, 64), "FK4")
+    north = place.directional_offset_by(0 * units.deg, 10 * units.arcsec)
+    mask = region_masks([f"{north.ra.deg}deg {north.dec.deg}deg 3arcsec"], frame)
+    x, y = np.argwhere(next(iter(mask.values()))).mean(axis=0)
+    assert x == pytest.approx(32, abs=0.5) and y == pytest.approx(42, abs=0.5)

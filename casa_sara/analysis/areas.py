@@ -20,7 +20,7 @@ RIGHT = "a circle as '19h59m28.3s +40d44m02s 1.5arcsec', or a CRTF or DS9 file o
 class Frame:
     """Where an image is, in SIN projection: `centre_deg` of pixel (nx//2, ny//2), `cell_arcsec` (x, y) and `shape`.
 
-    `radesys` is FITS's word for the frame: 'FK5' is CASA's J2000.
+    `radesys` is FITS's word for the frame: 'FK5' is CASA's J2000, 'FK4' its B1950.
     """
 
     centre_deg: tuple[float, float]
@@ -47,7 +47,7 @@ class Frame:
         wcs = WCS(naxis=2)
         wcs.wcs.ctype = ["RA---SIN", "DEC--SIN"]
         wcs.wcs.radesys = self.radesys
-        wcs.wcs.equinox = 2000.0
+        wcs.wcs.equinox = 1950.0 if self.radesys == "FK4" else 2000.0
         wcs.wcs.crval = self.centre_deg
         wcs.wcs.crpix = [n // 2 + 1 for n in self.shape]
         wcs.wcs.cdelt = [-width / 3600, self.cell_arcsec[1] / 3600]
