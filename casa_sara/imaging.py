@@ -16,7 +16,7 @@ from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.noise import noise_from_differences
-from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.operators.measurement import MeasurementOperator, check_cell
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
@@ -58,15 +58,18 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
     data.notes.extend(_limits(data, grid))
+    plane = define_image_plane(data, selection, grid)
+    if not plane.mask.any():
+        data.notes.append(f"phasecenter = '{grid.phasecenter}': the image is outside the primary beam, and masked everywhere")
     for note in data.notes:
         log.warn(note)
-    plane = define_image_plane(data, selection, grid)
     start = read_model(output.startmodel, plane) if output.startmodel else None
     # split and weigh
     block_of_sample, blocks = snapshot_blocks(data, output.blocks)
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise = noise_from_differences(data, offsets)
     _describe(data, blocks, noise)
+    _point_spread(data, grid, weighting, options, plane)  # what cannot be weighed or restored is refused before the hours
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
@@ -75,10 +78,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         model = reconstruction.model
         data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
-    weights = imaging_weights(data, grid, weighting)
-    operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
-    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
-    beam = fit_beam(psf, plane)
+    weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
     residual = dirty_image(operator, data.vis - operator.forward(model), weights)
     images = dict(psf=psf, residual=residual, model=model)
     write_products(output.imagename, plane, images, sum_of_weights(data, selection, weights), beam,
@@ -90,9 +90,23 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     return Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
 
 
+def _point_spread(data, grid, weighting, options, plane):
+    """Return the imaging weights, the operator of the dirty images, the PSF and the beam fitted to it."""
+    weights = imaging_weights(data, grid, weighting)
+    operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
+    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
+    return weights, operator, psf, fit_beam(psf, plane)
+
+
 def _limits(data, grid):
-    """What the user should know of this image plane and these baselines."""
+    """What the user should know of this image plane and these baselines; raise where no image can be made of them."""
     notes = []
+    check_cell(data.uvw[:2], grid.cell_rad)
+    width = min(n * cell for n, cell in zip(grid.shape, grid.cell_rad))
+    if width * data.max_uv < 1:
+        cells = [f"{np.degrees(cell) * 3600:.4g}arcsec" for cell in grid.cell_rad]
+        raise ValueError(f"imsize = {list(grid.shape)} with cell = {cells} is an image {np.degrees(width) * 3600:.3g} arcsec "
+                         f"wide: should hold the finest fringe at least, {np.degrees(1 / data.max_uv) * 3600:.3g} arcsec")
     arcsec = np.degrees(grid.cell_rad[0]) * 3600
     pixels = 1 / (data.max_uv * max(grid.cell_rad))
     if pixels < FEWEST_PIXELS:

@@ -45,10 +45,13 @@ def load(path: str | os.PathLike) -> Any:
     Raises
     ------
     ValueError
-        It is no JSON.
+        It is no JSON, or nested without end; the message names the file.
     """
-    with open(path, encoding="utf-8") as file:
-        return _numbers(json.load(file))
+    try:
+        with open(path, encoding="utf-8") as file:
+            return _numbers(json.load(file))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"'{path}' is not the JSON that was written: {error}") from error
 
 
 def _spelled(value: Any) -> Any:

@@ -209,7 +209,8 @@ def test_history_says_weighting_and_parameters(tmp_path):
 
 def test_record_of_tsara_is_read(tmp_path):
     one, *_ = product(tmp_path / "one")
-    record = {"blocks": [{"noise_measured": float("nan")}], "history": {"rel_change": [np.inf, 0.5]}}
+    record = {"blocks": [{"ms": "a.ms", "scans": [1], "noise_measured": float("nan")}],
+              "history": {"iteration": [1, 2], "rel_change": [np.inf, 0.5]}}
     jsonfile.save(one + ".sara.json", record)
     comparison = compare_images(Comparing((one,)), single=True)
     assert np.isnan(comparison.products[0].record["blocks"][0]["noise_measured"])

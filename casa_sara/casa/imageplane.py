@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casa_sara.casa.integrity import reading
 from casa_sara.casa.quantities import check_frequency
 from casa_sara.casa.tools import opened
 
@@ -118,12 +119,14 @@ def _make_primary_beam(visibilities, selection, grid, root):
     imager = casatools.synthesisimager()
     try:
         for number in _by_start(visibilities):
-            imager.selectdata(_selection_record(selection, number))
+            with reading(selection.vis[number]):
+                imager.selectdata(_selection_record(selection, number))
         try:
             imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
         except RuntimeError as error:
-            parameters = f"imsize = {list(grid.shape)}, projection = '{grid.projection}', reffreq = '{grid.reffreq}'"
-            raise ValueError(f"{parameters}: CASA makes no image of them: {str(error).strip()}") from error
+            parameters = (f"imsize = {list(grid.shape)}, projection = '{grid.projection}', reffreq = '{grid.reffreq}', "
+                          f"vis = {list(selection.vis)}")
+            raise ValueError(f"{parameters}: CASA makes no image of them: {' '.join(str(error).split())}") from error
         imager.makepb()
     finally:
         imager.done()

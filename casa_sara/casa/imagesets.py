@@ -7,8 +7,8 @@ import os
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from casa_sara import jsonfile
 from casa_sara.casa.products import RECORD
+from casa_sara.casa.record import read_record
 from casa_sara.casa.skyimage import SkyImage, read_header, read_sky_image
 
 __all__ = ["ImageSet", "check_same_data", "data_names", "read_image_set"]
@@ -91,7 +91,7 @@ def read_image_set(given, name="", with_residual=True):
         parameters |= of_image
     record = root + RECORD
     return ImageSet(name or os.path.basename(root), model, residual, next(filter(None, beams), None),
-                    parameters | model.parameters, jsonfile.load(record) if os.path.isfile(record) else {})
+                    parameters | model.parameters, read_record(record) if os.path.isfile(record) else {})
 
 
 def check_same_data(sets):

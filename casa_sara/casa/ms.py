@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 from casa_sara.casa.frames import Geometry, image_direction, separation
+from casa_sara.casa.integrity import reading
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
+from casa_sara.casa.usable import IN_FLAGS, SMALLEST, Usability
 from casa_sara.visibilities import RowTable, Visibilities
 
 __all__ = ["read_visibilities"]
 
 _CHUNK = 400_000  # complex numbers read at a time
 _ONE_POINTING = 1e-6  # rad; fields closer than this share their primary beam
+_WIDEST_BEAM = 10.0  # degrees; no field is farther from the image's centre
 _ROW_COLUMNS = {
     "time": "TIME",
     "interval": "INTERVAL",
@@ -64,20 +66,28 @@ def read_visibilities(selection, phasecenter="", stokes="I"):
         raise ValueError(f"stokes = '{stokes}' cannot be imaged: only stokes = 'I' can")
     selected, notes = select_data(selection)
     image = image_direction(phasecenter, selected)
+    _check_directions(phasecenter, image, selected)
     table = _SampleTable()
-    low, high = np.inf, 0.0
+    low, high, unused = np.inf, 0.0, []
     for ms in selected:
         geometry = Geometry(ms, image)
-        with opened("table", ms.name) as tb:
+        with reading(ms.name), opened("table", ms.name) as tb:
+            before = table.size
             for group in ms.groups:
                 for chunk in _chunks(tb, ms, group):
                     table.add(chunk, ms, group, geometry)
+        if table.size == before:
+            unused.append(f"no sample of '{ms.name}' can be used: nothing of it is imaged")
         low, high = min(low, geometry.freq_range_hz[0]), max(high, geometry.freq_range_hz[1])
+    dropped = table.usable.dropped
     if table.size == 0:
-        raise ValueError(f"no sample of {', '.join(selection.vis)} can be used: {_counts(table.dropped)}")
+        raise ValueError(f"vis: no sample of {', '.join(selection.vis)} can be used: {_counts(dropped)}")
+    if table.usable.strongest < SMALLEST:
+        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {table.size} samples of "
+                         f"{', '.join(selection.vis)} that can be used are zero: it may never have been filled")
     return table.visibilities(
         ms_names=tuple(selection.vis),
-        notes=notes + _notes(selected, table.dropped),
+        notes=notes + unused + _notes(selected, dropped),
         phase_center=image,
         freq_range_hz=(low, high),
         spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
@@ -108,7 +118,7 @@ def _chunks(tb, ms, group):
         try:
             yield _read(part, rows, ms.column, weights, group)
         except RuntimeError as error:
-            raise RuntimeError(f"vis = '{ms.name}': rows {rows[0]} to {rows[-1]} cannot be read: {error}") from error
+            raise RuntimeError(f"rows {rows[0]} to {rows[-1]}: {error}") from error
         finally:
             part.close()
 
@@ -148,7 +158,7 @@ class _SampleTable:
     """The usable samples of all chunks so far."""
 
     def __init__(self):
-        self.dropped = Counter()
+        self.usable = Usability()
         self.size = 0
         self._rows_so_far = 0
         self._samples = {name: [] for name in ("vis", "weight", "imaging_weight", "uvw", "row", "chan")}
@@ -156,7 +166,7 @@ class _SampleTable:
 
     def add(self, chunk, ms, group, geometry):
         """Whiten, turn and append the usable samples of a chunk."""
-        ok = self._usable(chunk)
+        ok = self.usable(chunk)
         columns = chunk.columns
         kept = ok.any(axis=1)
         uvw, shift = geometry.wavelengths(group, columns["field"], columns["time"], np.where(kept, chunk.uvw_m, 0.0))
@@ -183,29 +193,10 @@ class _SampleTable:
         self._rows_so_far += int(kept.sum())
         self.size += vis.size
 
-    def _usable(self, chunk):
-        """Return the bool (R, C) of samples to keep; count the others by the first reason that applies."""
-        autocorrelation = chunk.columns["antenna1"] == chunk.columns["antenna2"]
-        reasons = {
-            "autocorrelation": autocorrelation[:, None],
-            "flagged row": chunk.flag_row[:, None],
-            "flagged": chunk.flag,
-            "non-finite data": ~np.all([np.isfinite(hand) for hand in chunk.vis], axis=0),
-            "non-finite weight": ~np.all([np.isfinite(hand) for hand in chunk.weight], axis=0),
-            "non-positive weight": np.any([hand <= 0 for hand in chunk.weight], axis=0),
-            "non-finite uvw": ~np.isfinite(chunk.uvw_m).all(axis=0)[:, None],
-        }
-        ok = np.ones(chunk.flag.shape, dtype=bool)
-        for reason, bad in reasons.items():
-            self.dropped[reason] += int(np.count_nonzero(ok & bad))
-            ok &= ~bad
-        return ok
-
     def visibilities(self, **about):
         """Join the chunks, one column after the other to keep the peak of memory low."""
         samples, rows = ({name: _join(lists, name) for name in tuple(lists)} for lists in (self._samples, self._rows))
-        dropped = {reason: count for reason, count in self.dropped.items() if count}
-        return Visibilities(**samples, rows=RowTable(**rows), dropped=dropped, **about)
+        return Visibilities(**samples, rows=RowTable(**rows), dropped=self.usable.dropped, **about)
 
 
 def _join(lists, name):
@@ -213,16 +204,26 @@ def _join(lists, name):
     return np.concatenate(lists.pop(name), axis=-1)
 
 
+def _check_directions(phasecenter, image, selected):
+    """Raise when a field is elsewhere on the sky."""
+    for ms in selected:
+        for number, direction in ms.fields.items():
+            apart = np.degrees(separation(direction, image))
+            if apart > _WIDEST_BEAM:
+                raise ValueError(f"phasecenter = '{phasecenter}': field {number} of '{ms.name}' is {apart:.3g} degrees from "
+                                 f"the centre of the image: should be within {_WIDEST_BEAM:g}; choose fields with field")
+
+
 def _counts(dropped):
     """Spell the dropped samples for a message."""
-    return ", ".join(f"{count} samples left out as {reason}" for reason, count in dropped.items() if count)
+    return ", ".join(f"{count} samples left out as {reason}" for reason, count in dropped.items())
 
 
 def _notes(selected, dropped):
     """Return the warnings that the data themselves give rise to."""
     notes = []
-    unusable = {reason: count for reason, count in dropped.items() if reason.startswith("non-")}
-    if any(unusable.values()):
+    unusable = {reason: count for reason, count in dropped.items() if reason not in IN_FLAGS}
+    if unusable:
         notes.append(f"unflagged samples cannot be used: {_counts(unusable)}")
     centres = [(ms, field) for ms in selected for field in ms.fields]
     spread = max(separation(ms.fields[field], centres[0][0].fields[centres[0][1]]) for ms, field in centres)

@@ -53,7 +53,11 @@ def msselect(name, strings):
         with opened("table", name) as tb:
             return np.arange(tb.nrows()), {}
     with opened("ms", name) as tool:
-        understood = tool.msselect({MSSELECT_KEYS[parameter]: value for parameter, value in strings.items()})
+        try:
+            understood = tool.msselect({MSSELECT_KEYS[parameter]: value for parameter, value in strings.items()})
+        except UnicodeDecodeError:  # the parser cuts its message between the bytes of a letter
+            raise ValueError(f"{in_words(strings)} does not select from '{name}': it holds letters that CASA does not "
+                             "understand") from None
         if understood:
             ranges = np.asarray(tool.msselectedindices()["channel"]).reshape(-1, 4).tolist()
             rows = np.sort(tool.range(["rows"])["rows"])
@@ -102,7 +106,7 @@ def _raise_bad_expression(name, strings):
             try:
                 tool.msselectedindices()
                 reason = "no match was found for it"
-            except RuntimeError as error:
+            except (RuntimeError, UnicodeDecodeError) as error:
                 reason = str(error).replace("\n", " ").strip()
         raise ValueError(f"{parameter} = '{value}' does not select from '{name}': {reason}")
     raise ValueError(f"{in_words(strings)} cannot be applied to '{name}'")

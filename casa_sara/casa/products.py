@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import shutil
 import tempfile
@@ -50,11 +51,11 @@ def check_imagename(imagename, shape):
         raise FileNotFoundError(f"imagename = '{imagename}': the folder '{folder}' does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise PermissionError(f"imagename = '{imagename}': the folder '{folder}' cannot be written to")
-    needed = (len(PRODUCTS) * 4 + 3) * int(np.prod(shape)) + 2_000_000
+    needed = (len(PRODUCTS) * 4 + 3) * math.prod(shape) + 2_000_000
     free = shutil.disk_usage(folder).free
     if free < needed:
         space = f"the images take {needed / 1e6:.0f} MB, '{folder}' has {free / 1e6:.0f} MB left"
-        raise OSError(errno.ENOSPC, f"imagename = '{imagename}': {space}")
+        raise OSError(errno.ENOSPC, f"imagename = '{imagename}', imsize = {list(shape)}: {space}")
 
 
 @contextmanager

@@ -47,8 +47,8 @@ def fit_beam(psf, plane):
             beam = ia.restoringbeam()
     cell = abs(plane.csys["direction0"]["cdelt"]).min() * 180 * 3600 / math.pi
     if not beam or not cell / 10 < beam["minor"]["value"] < math.inf:
-        reason = f"cell = '{cell:.4g}arcsec' is too large, or imsize too small"
-        raise ValueError(f"no beam could be fitted to the PSF: {reason}")
+        raise ValueError(f"no beam could be fitted to the PSF: cell = '{cell:.4g}arcsec' is too large, imsize = "
+                         f"{list(psf.shape)} too small, or vis and its selection have too few baselines")
     return beam
 
 

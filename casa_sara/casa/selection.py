@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casa_sara.casa.integrity import check_measurement_set, reading
 from casa_sara.casa.msselect import MSSELECT_KEYS, in_words, msselect
 from casa_sara.casa.tools import opened
 
@@ -96,13 +97,14 @@ def select_data(selection):
     _check_parameters(selection)
     selected, notes, empty = [], [], []
     for number, name in enumerate(selection.vis):
-        _check_measurement_set(name)
-        rows, channels = msselect(name, selection.of(number))
-        if rows.size == 0:
-            empty.append(f"{in_words(selection.of(number))} leaves no rows of '{name}'")
-            continue
-        column = _data_column(name, selection.datacolumn, notes)
-        selected.append(_describe(number, name, column, rows, channels, notes))
+        check_measurement_set(name)
+        with reading(name):
+            rows, channels = msselect(name, selection.of(number))
+            if rows.size == 0:
+                empty.append(f"{in_words(selection.of(number))} leaves no rows of '{name}'")
+                continue
+            column = _data_column(name, selection.datacolumn, notes)
+            selected.append(_describe(number, name, column, rows, channels, notes))
     if not selected:
         raise ValueError("the data selection leaves nothing to image: " + "; ".join(empty))
     return selected, notes + [f"{reason}: nothing of it is imaged" for reason in empty]
@@ -121,27 +123,11 @@ def _check_parameters(selection):
                 f"{parameter} = {list(value)} has {len(value)} entries for {len(selection.vis)} MeasurementSets "
                 "in vis: it takes one string for all of them, or one for each"
             )
-
-
-def _check_measurement_set(name):
-    """Raise unless `name` is a MeasurementSet with rows."""
-    if not os.path.exists(name):
-        raise FileNotFoundError(f"vis = '{name}' does not exist")
-    if not os.path.isdir(name):
-        raise ValueError(
-            f"vis = '{name}' is a file: a MeasurementSet is a directory (importuvfits makes one of a UVFITS file)"
-        )
-    if not os.path.exists(os.path.join(name, "table.dat")):
-        raise ValueError(f"vis = '{name}' is a directory, but not a MeasurementSet: it holds no table.dat")
-    try:
-        with opened("table", name) as tb:
-            is_ms, rows = {"UVW", "ANTENNA1", "DATA_DESC_ID", "FLAG"} <= set(tb.colnames()), tb.nrows()
-    except RuntimeError as error:
-        raise ValueError(f"vis = '{name}' cannot be opened as a table: {error}") from error
-    if not is_ms:
-        raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet")
-    if rows == 0:
-        raise ValueError(f"vis = '{name}' is a MeasurementSet without rows")
+    chosen = [(os.path.realpath(name), selection.of(number)) for number, name in enumerate(selection.vis)]
+    for number, one in enumerate(chosen):
+        if one in chosen[:number]:
+            raise ValueError(f"vis = {list(selection.vis)} has the same data of '{selection.vis[number]}' twice: should "
+                             "name each MeasurementSet once, or select different parts of it")
 
 
 def _data_column(name, datacolumn, notes):

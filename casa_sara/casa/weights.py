@@ -20,10 +20,12 @@ from casa_sara.casa.frames import SPEED_OF_LIGHT
 from casa_sara.casa.quantities import radians
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
+from casa_sara.casa.usable import IN_FLAGS
 
 __all__ = ["dirty_image", "imaging_weights", "sampling_density", "sum_of_weights"]
 
 WEIGHTINGS = ("natural", "uniform", "briggs")
+MOST_CELLS = 16384  # of the uv grid, along each axis, that npixels may ask for
 _SELECTVIS_KEYS = {"timerange": "time", "antenna": "baseline"}
 _WAVELENGTHS = re.compile(r"\s*(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*(k|M|)(lambda)?\s*", re.IGNORECASE)
 
@@ -33,9 +35,9 @@ def sampling_density(visibilities, selection, grid):
 
     The uv cells are square, of side 1/(field of view) of the larger image side. imager reads
     the selection again, without autocorrelations and flagged rows; the MeasurementSets are
-    opened read-only and nothing is written to them. Where its grid cannot be right, because
-    it holds less than the sample itself (non-finite or negative weights in the data), the
-    samples are counted here.
+    opened read-only and nothing is written to them. Where samples were left out that no flag
+    told it of, and where its grid cannot be right, because it holds less than the sample
+    itself, the samples are counted here.
 
     Parameters
     ----------
@@ -54,8 +56,13 @@ def sampling_density(visibilities, selection, grid):
     u, v = _field_uv(visibilities, "data")
     cells = _cells(u, v, (side, side), (cell, cell))
     density = np.zeros(visibilities.size, np.float32)
-    for number in np.unique(visibilities.rows.ms):
-        density += _imager_grid(visibilities.ms_names[number], selection.of(number), side, cell)[cells]
+    if visibilities.dropped.keys() <= set(IN_FLAGS):
+        for number in np.unique(visibilities.rows.ms):
+            try:
+                density += _imager_grid(visibilities.ms_names[number], selection.of(number), side, cell)[cells]
+            except RuntimeError as error:
+                raise ValueError(f"vis = '{visibilities.ms_names[number]}': CASA finds no density of the samples, on {side} x "
+                                 f"{side} cells for imsize = {list(grid.shape)}: {' '.join(str(error).split())}") from error
     weight = visibilities.imaging_weight
     bad = ~((density >= 0.5 * weight) & np.isfinite(density))
     if bad.any():
@@ -94,6 +101,8 @@ def imaging_weights(visibilities, grid, weighting):
         return weights
     u, v = _field_uv(visibilities, "LSRK")
     if weighting.weighting != "natural":
+        if weighting.npixels > MOST_CELLS:
+            raise ValueError(f"npixels = {weighting.npixels}: should be at most {MOST_CELLS}")
         shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
         cells = _cells(-u, v, shape, grid.cell_rad)
         counts = _count(cells, _cells(u, -v, shape, grid.cell_rad), weights, shape[0] * shape[1])

@@ -22,7 +22,7 @@ from casa_sara.operators.decimation import (
     AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable)
 from casa_sara.operators.nufft import NonUniformFFT
 
-__all__ = ["MeasurementOperator", "choose_eps"]
+__all__ = ["MeasurementOperator", "check_cell", "choose_eps"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 SMALLEST_EPS = {np.dtype(np.float32): 1e-6, np.dtype(np.float64): 1e-13}
@@ -116,17 +116,22 @@ class MeasurementOperator:
         return out
 
 
-def _cycles_per_pixel(uv, cell_rad):
-    """Baselines (2, M) as frequencies along the image axes."""
+def check_cell(uv, cell_rad):
+    """Raise ValueError unless pixels of `cell_rad` (one number, or one per axis) sample the fringes of uv (2, M)."""
     cell = np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))
     if not np.all(cell > 0):
         raise ValueError(f"cell={cell_rad} must be positive, in radians")
-    frequencies = uv * cell[:, None] * [[-1.0], [1.0]]
-    if np.abs(frequencies).max() > 0.5:
-        largest = 0.5 / np.abs(uv).max() * ARCSEC_PER_RAD
-        raise ValueError(f"cell={cell.max() * ARCSEC_PER_RAD:.4g}arcsec is too large for the longest baseline: "
-                         f"use at most cell={0.999 * largest:.4g}arcsec")
-    return frequencies
+    longest = np.abs(uv).max(axis=1)
+    if np.any(longest * cell > 0.5):
+        largest = 0.5 / longest.max() * ARCSEC_PER_RAD
+        raise ValueError(f"cell={cell.max() * ARCSEC_PER_RAD:.4g}arcsec is too large for the longest baseline, "
+                         f"{longest.max() / 1e3:.4g} klambda: use at most cell={0.999 * largest:.4g}arcsec")
+
+
+def _cycles_per_pixel(uv, cell_rad):
+    """Baselines (2, M) as frequencies along the image axes."""
+    check_cell(uv, cell_rad)
+    return uv * np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))[:, None] * [[-1.0], [1.0]]
 
 
 def _checked(array, name, shape, dtype):

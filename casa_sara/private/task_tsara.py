@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -86,14 +87,15 @@ def _cell_rad(value):
 
 
 def _solver_options(parameters):
-    if parameters["databound"] == "fixed" and not (parameters["l2bound"] and min(parameters["l2bound"]) > 0):
+    if parameters["databound"] == "fixed" and not parameters["l2bound"]:
         raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
                          "blocks or one for each, in units of what the weights say")
     if not parameters["regscale"] > 0:
         raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the noise")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}
     values = {name: tuple(value) if isinstance(value := parameters[name], list) else value for name in names}
-    return SolverOptions(nthreads=parameters["nthreads"] or available_cores(), **values)
+    nthreads = min(parameters["nthreads"] or available_cores(), os.cpu_count() or 1)
+    return SolverOptions(nthreads=nthreads, **values)
 
 
 def _output(parameters, grid):

@@ -40,7 +40,7 @@ PARAMETERS = (
     Parameter('boundrelchange', ('double',), 0.01, 'Relative change of the model below which bounds may move', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('boundstep', ('double',), 0.618, 'Fraction of the way to the residual that a bound moves', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('boundinterval', ('int',), 20, 'Fewest iterations between two moves of a bound', minimum=1.0, opener='databound', open_on=('adapt',)),
-    Parameter('l2bound', ('doubleVec',), [], 'Noise level of each block, as a multiple of what the weights say', minimum=0.0, opener='databound', open_on=('fixed',)),
+    Parameter('l2bound', ('doubleVec',), [], 'Noise level of each block, as a multiple of what the weights say', minimum=1e-06, maximum=1000000.0, opener='databound', open_on=('fixed',)),
     Parameter('nreweights', ('int',), 20, 'Maximum number of re-weightings', minimum=0.0),
     Parameter('reweightdecay', ('double',), 0.618, 'Factor on the scale of the sparsity weights at each re-weighting', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
     Parameter('reweighttol', ('double',), 0.01, 'Relative change of the model between re-weightings that ends them', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
@@ -48,7 +48,7 @@ PARAMETERS = (
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
     Parameter('blocks', ('int',), 0, 'Number of data blocks, each with its own bound; 0: one per snapshot', minimum=0.0),
-    Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0),
+    Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0, maximum=1024.0),
     Parameter('fullsummary', ('bool',), False, 'Return dictionary with complete convergence history'),
     Parameter('report', ('bool',), False, 'Write a report of the run, imagename.report/report.html'),
     Parameter('restart', ('bool',), False, 'Continue from imagename.model'),
@@ -335,7 +335,7 @@ class _tsara:
         Another number cuts the data, in the order of time, into that many blocks of about one size.
 
     nthreads : int, default 0
-        Threads for the Fourier and wavelet transforms.
+        Threads for the Fourier and wavelet transforms; no more than the machine has cores.
 
     fullsummary : bool, default False
         True returns every iteration in the record 'sara' of the returned dictionary; False the

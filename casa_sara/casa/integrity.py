@@ -1,0 +1,89 @@
+"""Whether a MeasurementSet is one, and whole enough for CASA, which a broken one can hang or crash."""
+
+from __future__ import annotations
+
+import os
+from contextlib import contextmanager
+
+import numpy as np
+
+from casa_sara.casa.tools import opened
+
+__all__ = ["check_measurement_set", "reading"]
+
+_LATEST_S = 1e11  # MJD seconds, in the year 5000
+_NEEDED = {"UVW", "ANTENNA1", "DATA_DESC_ID", "FLAG"}
+
+
+@contextmanager
+def reading(name):
+    """Turn what CASA and Python say of an unreadable MeasurementSet into a ValueError that names `vis`."""
+    try:
+        yield
+    except (RuntimeError, UnicodeDecodeError) as error:
+        raise ValueError(f"vis = '{name}' cannot be read: {' '.join(str(error).split())}") from error
+
+
+def check_measurement_set(name):
+    """Raise unless `name` is a MeasurementSet with rows, whose numbers CASA survives.
+
+    msmetadata ends the process at a frequency that is no number, and never returns from such a time.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        With the reason, and the row where it is one.
+    """
+    if not os.path.exists(name):
+        raise FileNotFoundError(f"vis = '{name}' does not exist")
+    if not os.path.isdir(name):
+        raise ValueError(
+            f"vis = '{name}' is a file: a MeasurementSet is a directory (importuvfits makes one of a UVFITS file)"
+        )
+    if not os.path.exists(os.path.join(name, "table.dat")):
+        raise ValueError(f"vis = '{name}' is a directory, but not a MeasurementSet: it holds no table.dat")
+    try:
+        with opened("table", name) as tb:
+            is_ms, rows = _NEEDED <= set(tb.colnames()), tb.nrows()
+    except (RuntimeError, UnicodeDecodeError) as error:
+        raise ValueError(f"vis = '{name}' cannot be opened as a table: {error}") from error
+    if not is_ms:
+        raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet")
+    if rows == 0:
+        raise ValueError(f"vis = '{name}' is a MeasurementSet without rows")
+    with reading(name):
+        _check_numbers(name)
+
+
+def _check_numbers(name):
+    """Raise on times, fields and frequencies that are none."""
+    fields = _cells(name, "FIELD", "PHASE_DIR")
+    for row, direction in enumerate(fields):
+        _check(name, "FIELD/PHASE_DIR", row, direction, np.isfinite(direction), "finite")
+    for column in ("CHAN_FREQ", "CHAN_WIDTH"):
+        for row, values in enumerate(_cells(name, "SPECTRAL_WINDOW", column)):
+            right = np.isfinite(values) & ((values > 0) if column == "CHAN_FREQ" else (values != 0))
+            _check(name, f"SPECTRAL_WINDOW/{column}", row, values, right, "a frequency in Hz")
+    with opened("table", name) as tb:
+        time, interval, field = (tb.getcol(column) for column in ("TIME", "INTERVAL", "FIELD_ID"))
+    for column, values, right, words in (
+        ("TIME", time, (time >= 0) & (time < _LATEST_S), "a time in MJD seconds"),
+        ("INTERVAL", interval, np.isfinite(interval), "a number of seconds"),
+        ("FIELD_ID", field, (field >= 0) & (field < len(fields)), f"a row of FIELD, 0 to {len(fields) - 1}"),
+    ):
+        if not right.all():
+            row = int(np.argmin(right))
+            _check(name, column, row, values[row], right[row], words)
+
+
+def _cells(name, subtable, column):
+    """Return the array in every row of one column of a subtable."""
+    with opened("table", os.path.join(name, subtable)) as tb:
+        return [np.asarray(tb.getcell(column, row)) for row in range(tb.nrows())]
+
+
+def _check(name, column, row, values, right, words):
+    """Raise unless all values of this cell are right."""
+    if not np.all(right):
+        wrong = np.ravel(values)[np.argmin(np.ravel(right))]
+        raise ValueError(f"vis = '{name}': {column} of row {row} holds {wrong}: should be {words}")

@@ -1,0 +1,121 @@
+"""A small observation, and every way in which its MeasurementSet is spoiled here.
+
+FAULTS are wrong numbers, each with the samples that are wrong; HOPELESS leaves nothing to image; BROKEN are
+MeasurementSets that are none any more. Each is a function of the path of a copy that it spoils.
+"""
+
+import os
+import shutil
+
+import numpy as np
+from simulated_ms import column, edit, remove_columns, simulate
+
+ARCSEC = np.radians(1 / 3600)
+SKY = ((1.0, -5 * ARCSEC, 7 * ARCSEC), (0.5, 8 * ARCSEC, -3 * ARCSEC))
+ROW, CHANNEL = 40, 1  # of what is spoiled
+GRID = dict(imsize=64, cell="1arcsec", datacolumn="data")
+
+
+def observe(path, **changes):
+    """Write 28 baselines in 12 integrations, three channels and two hands."""
+    return simulate(path, **(dict(configuration="c", antennas=8, sky=SKY, noise=0.02) | changes))
+
+
+def put(col, where, value):
+    """Return a function that sets a part of a column of a MeasurementSet."""
+
+    def spoil(name):
+        values = column(name, col)
+        values[where] = value
+        edit(name, col, lambda old: values)
+
+    return spoil
+
+
+SAMPLE, CORRELATION = (slice(None), CHANNEL, ROW), (0, CHANNEL, ROW)
+OF_ROW, ONE_CHANNEL = (..., ROW), (slice(None), CHANNEL)
+
+
+def flag(where):
+    """Return a function that flags samples [correlation, channel, row]."""
+    return put("FLAG", where, True)
+
+
+FAULTS = {  # name: (what spoils, the samples to flag instead)
+    **{f"one visibility {value}": (put("DATA", CORRELATION, value), SAMPLE)
+       for value in (np.nan, np.inf, 1j * np.nan, 1e10, 1e30, 3e38)},
+    **{f"one weight {value}": (put("WEIGHT", (0, ROW), value), OF_ROW)
+       for value in (np.nan, np.inf, 0.0, -1.0, 1e12, 1e30, 3e38)},
+    **{f"uvw of one row {value}": (put("UVW", OF_ROW, value), OF_ROW) for value in (np.nan, np.inf, 1e12, 1e300, 0.0)},
+    **{f"one channel {value}": (put("DATA", ONE_CHANNEL, value), ONE_CHANNEL) for value in (np.nan, 1e12, 1e30)},
+}
+HOPELESS = {  # nothing is left, or nothing to image
+    "all flagged": flag(...),
+    "all rows flagged": put("FLAG_ROW", ..., True),
+    "all weights zero": put("WEIGHT", ..., 0.0),
+    "all weights negative": put("WEIGHT", ..., -1.0),
+    "all weights 1e-38": put("WEIGHT", ..., 1e-38),
+    "all uvw zero": put("UVW", ..., 0.0),
+    "all data NaN": put("DATA", ..., np.nan),
+    "all data zero": put("DATA", ..., 0.0),
+    "all data 1e38": put("DATA", ..., 1e38),
+}
+
+
+def cut(path, fraction=0.5):
+    """Return a function that truncates a file of a MeasurementSet."""
+
+    def spoil(name):
+        path_ = os.path.join(name, path)
+        os.truncate(path_, int(os.path.getsize(path_) * fraction))
+
+    return spoil
+
+
+def garble(path, seed):
+    """Return a function that overwrites one byte in a hundred of a file of a MeasurementSet."""
+
+    def spoil(name):
+        path_ = os.path.join(name, path)
+        with open(path_, "rb") as file:
+            content = np.frombuffer(file.read(), np.uint8).copy()
+        rng = np.random.default_rng(seed)
+        content[rng.integers(0, content.size, content.size // 100)] = rng.integers(0, 256, content.size // 100)
+        with open(path_, "wb") as file:
+            file.write(content.tobytes())
+
+    return spoil
+
+
+def without(subtable):
+    return lambda name: shutil.rmtree(os.path.join(name, subtable))
+
+
+def lacking(col, subtable=""):
+    return lambda name: remove_columns(os.path.join(name, subtable), col)
+
+
+def put_in(subtable, col, value):
+    return lambda name: edit(os.path.join(name, subtable), col, lambda old: np.full_like(old, value))
+
+
+SUBTABLES = ("ANTENNA", "DATA_DESCRIPTION", "FEED", "FIELD", "OBSERVATION", "POLARIZATION", "SPECTRAL_WINDOW")
+BROKEN = {
+    **{f"table.dat cut to {fraction}": cut("table.dat", fraction) for fraction in (0, 0.5, 0.99)},
+    **{f"table.dat garbled {seed}": garble("table.dat", seed) for seed in range(4)},
+    "column file cut": cut("table.f2"),
+    "data file cut": cut("table.f2_TSM1"),
+    **{f"no {name}": without(name) for name in SUBTABLES},
+    **{f"{name} cut": cut(f"{name}/table.f0") for name in SUBTABLES},
+    "no column FLAG": lacking("FLAG"),
+    "no column WEIGHT": lacking("WEIGHT"),
+    "no column DATA": lacking("DATA"),
+    "no column CHAN_FREQ": lacking("CHAN_FREQ", "SPECTRAL_WINDOW"),
+    "frequencies NaN": put_in("SPECTRAL_WINDOW", "CHAN_FREQ", np.nan),
+    "frequencies zero": put_in("SPECTRAL_WINDOW", "CHAN_FREQ", 0.0),
+    "field direction NaN": put_in("FIELD", "PHASE_DIR", np.nan),
+    "times NaN": put("TIME", ..., np.nan),
+    "one time NaN": put("TIME", ROW, np.nan),
+    "field number beyond the table": put("FIELD_ID", ..., 5),
+    "antenna number beyond the table": put("ANTENNA2", ROW, 50),
+}
