@@ -21,10 +21,11 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests" / folder) for folder in ("", "faults")]
 
-from spoiled import BROKEN, FAULTS, GRID, HOPELESS, observe  # noqa: E402
+from spoiled import BROKEN, CORRELATION, FAULTS, GRID, HOPELESS, observe, put  # noqa: E402
 
 LONGEST_S = 60
 SPOILING = {name: spoil for name, (spoil, _) in FAULTS.items()} | HOPELESS | BROKEN
+SPOILING["one visibility 1e4"] = put("DATA", CORRELATION, 1e4)
 CALLS = {  # of a whole MeasurementSet
     "cell far too large": dict(cell="100arcsec"),
     "cell far too small": dict(cell="1e-9arcsec"),
@@ -33,7 +34,20 @@ CALLS = {  # of a whole MeasurementSet
     "image elsewhere on the sky": dict(phasecenter="J2000 07h59m28.5s -40d44m02s"),
     "autocorrelations only": dict(antenna="*&&&"),
     "one MeasurementSet twice": dict(vis=["spoiled.ms", "spoiled.ms"]),
+    "odd size": dict(imsize=[61, 67]),
+    "one baseline": dict(antenna="0&1"),
+    "one visibility": dict(vis="one.ms"),
+    "other hands": dict(vis=["spoiled.ms", "linear.ms"]),
+    "other frame": dict(vis=["spoiled.ms", "topo.ms"]),
+    "other part of the sky": dict(vis=["spoiled.ms", "far.ms"]),
+    "nothing in one of several": dict(vis=["spoiled.ms", "linear.ms"], scan=["", "7"]),
     "no fault": {},
+}
+OTHERS = {
+    "one.ms": dict(antennas=2, scans=1, scan_seconds=10.0, spws=(("8.4GHz", "2MHz", 1),)),
+    "linear.ms": dict(correlations="XX YY"),
+    "topo.ms": dict(frame="TOPO"),
+    "far.ms": dict(fields=("J2000 03h00m00s +40d44m10s",), hour_angle=0),
 }
 
 
@@ -67,7 +81,7 @@ def attempt(name, folder):
     if run.returncode < 0:
         return f"the Python session dies of signal {-run.returncode}"
     results = [line for line in run.stdout.splitlines() if line.startswith("RESULT ")]
-    errors = [line for line in run.stderr.splitlines() if "Error" in line and "\t" not in line]
+    errors = [line for line in run.stderr.splitlines() if "Error" in line or "\tSEVERE\t" in line and "TAI_UTC" not in line]
     return results[-1].removeprefix("RESULT ") if results else "error: " + (errors or ["?"])[-1][:160]
 
 
@@ -77,6 +91,8 @@ def main():
         folder = Path(name)
         with contextlib.redirect_stdout(io.StringIO()):
             observe(folder / "whole.ms")
+            for other, changes in OTHERS.items():
+                observe(folder / other, **changes)
         for fault in (*SPOILING, *CALLS):
             if words in fault:
                 print(f"{fault}: {attempt(fault, folder)}", flush=True)

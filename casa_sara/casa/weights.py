@@ -241,5 +241,6 @@ def _half_width(value):
 def _taper(u, v, along, across, angle):
     """Return the Gaussian of these half widths; the angle runs from v (north) to u (east)."""
     sin, cos = np.float32(math.sin(angle)), np.float32(math.cos(angle))
-    square = ((u * sin + v * cos) / np.float32(along)) ** 2 + ((v * sin - u * cos) / np.float32(across)) ** 2
-    return np.exp2(-square)
+    with np.errstate(over="ignore", under="ignore"):  # 0 where it is that narrow
+        square = ((u * sin + v * cos) / np.float32(along)) ** 2 + ((v * sin - u * cos) / np.float32(across)) ** 2
+        return np.exp2(-square)

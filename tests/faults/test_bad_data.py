@@ -195,7 +195,8 @@ def test_spectral_frames_add_up(vis, tmp_path):
     edit(window, "CHAN_FREQ", lambda freq: freq * factor)
     edit(window, "MEAS_FREQ_REF", lambda code: code * 0 + 1)  # LSRK
     assert abs(factor - 1) > 5e-6
-    assert_same(image([vis, names[0]], tmp_path)[0], image([vis, names[1]], tmp_path)[0])
+    one, other = (image([vis, name], tmp_path, "residual", niter=0)[0] for name in names)
+    assert_same(one, other)
 
 
 def test_phase_centres_add_up_and_must_be_one_field(vis, tmp_path):

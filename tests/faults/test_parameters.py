@@ -139,3 +139,31 @@ def test_saracompare_names_the_parameter_that_it_refuses(vis, models, parameter)
 
     attempt()
     assert contents(vis) == before
+
+
+# Paths ------------------------------------------------------------------------------------------
+
+NAMES = ("with spaces", "Ünïcode ☆", "it's", 'say "hi"', "[brackets](and) {more}", "glob*?", "-leading-dash", "semi;colon&$HOME",
+         "new\nline", "percent%s", "comma,equal=", "back\\slash", "trailing ", "#hash", "~tilde", "n" * 200)  # fmt: skip
+REFUSED = ("semi;colon&$HOME",)  # CASA takes $HOME for the variable
+PRODUCTS = ("model", "psf", "residual", "image", "sumwt", "pb", "sara.json")
+
+
+@pytest.mark.parametrize("name", NAMES, ids=ascii)
+def test_any_name_of_a_file_works_or_is_refused(vis, tmp_path, name):
+    """The products stand under just the name that was asked for, or the parameter is named and nothing is left behind."""
+    folders = [("in", "out")] + [("", "")] * name.startswith(("-", "~"))
+    for number, (data, images) in enumerate(folders):
+        own, base = os.path.join(data, name), f"{name}{number}"
+        os.makedirs("out", exist_ok=True)
+        call = dict(vis=shutil.copytree(vis, own), imagename=os.path.join(images, base))
+        before, there = contents(own), set(os.listdir(images or "."))
+        try:
+            tsara(**call, niter=2, **SMALL)
+        except REFUSALS as error:
+            assert re.search(r"\b(vis|imagename)\b", str(error)), f"{type(error).__name__}: {error}"
+            assert name in REFUSED and set(os.listdir(images or ".")) == there
+        else:
+            assert set(os.listdir(images or ".")) - there == {f"{base}.{product}" for product in PRODUCTS}
+            assert name not in REFUSED
+        assert contents(own) == before
