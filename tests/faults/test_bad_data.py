@@ -189,12 +189,12 @@ def test_spectral_frames_add_up(vis, tmp_path):
     me = casatools.measures()
     me.doframe(me.observatory("VLA"))
     me.doframe(me.direction(*CYGNUS_A.split()))
-    me.doframe(me.epoch("UTC", f"{column(names[0], 'TIME').mean()!r}s"))
+    me.doframe(me.epoch("UTC", f"{float(column(names[0], 'TIME').mean())!r}s"))
     factor = me.measure(me.frequency("TOPO", "1Hz"), "LSRK")["m0"]["value"]
     window = names[1] + "/SPECTRAL_WINDOW"
     edit(window, "CHAN_FREQ", lambda freq: freq * factor)
     edit(window, "MEAS_FREQ_REF", lambda code: code * 0 + 1)  # LSRK
-    assert abs(factor - 1) > 5e-6
+    assert abs(factor - 1) > 5e-5
     one, other = (image([vis, name], tmp_path, "residual", niter=0)[0] for name in names)
     assert_same(one, other)
 

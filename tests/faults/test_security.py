@@ -144,9 +144,8 @@ def test_a_record_of_tsara_is_taken_and_every_broken_one_refused(tmp_path):
                     assert "x.sara.json" in str(error)
                     refused += 1
                     continue
-                product = SimpleNamespace(record=record)
-                convergence(tmp_path / "convergence.png", product)
-                block_noise(tmp_path / "noise.png", product)
+                draw = block_noise if name == "blocks" else convergence
+                draw(tmp_path / "picture.png", SimpleNamespace(record=record))
     assert refused > 60
 
 
