@@ -297,7 +297,7 @@ def test_imagename_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
         check_imagename("folder/", (8, 8))
     with pytest.raises(FileNotFoundError, match="the folder 'absent' does not exist"):
         check_imagename("absent/run", (8, 8))
-    with pytest.raises(OSError, match=r"imagename = 'run': the images take \d+ MB, '\.' has"):
+    with pytest.raises(OSError, match=r"imagename = 'run', imsize = .*: the images take \d+ MB, '\.' has"):
         check_imagename("run", (10**7, 10**7))
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(PermissionError, match="cannot be written to"):

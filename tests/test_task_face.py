@@ -249,7 +249,7 @@ def test_python_and_numpy_values_are_taken(received):
         ({"robust": "1", "weighting": "briggs"}, "robust = '1': should be a number"),
         ({"reltol": float("nan")}, "reltol = nan: should be a number"),
         ({"regscale": float("inf")}, "regscale = inf: should be a number"),
-        ({"l2bound": [1, -1], "databound": "fixed"}, r"l2bound = \[1, -1\]: should be a list of numbers, at least 0"),
+        ({"l2bound": [1, -1], "databound": "fixed"}, r"l2bound = \[1, -1\]: should be a list of numbers, at least 1e-06"),
         ({"imsize": [64, 0]}, r"imsize = \[64, 0\]: should be an integer or a list of integers, at least 1"),
         ({"imsize": "64"}, "imsize = '64': should be an integer or a list of integers"),
         ({"weighting": "Briggs"}, "weighting = 'Briggs': should be a string out of 'natural', 'uniform', 'briggs'"),
