@@ -122,6 +122,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
         first = startmodel / np.float32(unit_jy)
     ppd.start_from(first)
     ppd.rescale(STEP_BALANCE * _mean_brightness(first))
+    del first, residual
 
     schedule = schedule_of(options)
     if noise_only:
@@ -192,7 +193,7 @@ def _bounds(ppd, nnls_norms, weights, noise, options):
 
 def _is_noise_only(ppd, bounds):
     """Whether the naturally weighted dirty image holds no peak above 5 times its noise."""
-    whitening = np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(np.float32)
+    whitening = np.repeat(bounds.noise_weights.astype(np.float32), np.diff(ppd.offsets))
     dirty = ppd.measurement.adjoint(ppd.vis * whitening)
     return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(bounds.total_weight))
 

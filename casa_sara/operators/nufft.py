@@ -25,7 +25,7 @@ from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import (
     gather_rows, multiply, pair_sums, polynomials, scale_pairs, scatter_rows)
 
-__all__ = ["NonUniformFFT"]
+__all__ = ["NonUniformFFT", "memory_size"]
 
 TILE_ROWS = 16
 MAX_COLUMN_FREQUENCY = 0.42
@@ -58,21 +58,26 @@ class NonUniformFFT:
         beta = kaiser_bessel.kernel_shape(width, sigma)
         self._kernel = _kernel(width, beta, dtype)
         self._halo = width // 2 + 1
-        self._stride = 2 * (self._lengths[1] + 4)  # in reals; rows of 2^k cells would share cache lines
+        self._stride = _stride(self._lengths)
         self._place_points(frequencies, scales, width, dtype)
         self._allocate(width, dtype)
         self._place_samples(starts, counts, width, beta)
 
     def _place_points(self, frequencies, scales, width, dtype):
         """Sort the points by rows of tiles and share them out."""
-        place = (frequencies + 0.5) * np.array(self._lengths)[:, None] - width / 2
+        place = frequencies + 0.5
+        place *= np.array(self._lengths)[:, None]
+        place -= width / 2
         place[0] += self._halo
-        row, column = first = np.ceil(place).astype(np.int64)
+        row, column = cells = np.ceil(place).astype(np.int32)
+        place -= cells  # −1 … 0
         order = np.argsort(row // TILE_ROWS, kind="stable")
+        first = row[order] * np.int64(self._stride)
+        first += 2 * column[order]
         self._points = Points(
-            first=(row * self._stride + 2 * column)[order],
-            within=(1 - 2 * (first - place)).T[order].astype(dtype, order="C"),
-            scales=scales[order].astype(dtype),
+            first=first,
+            within=np.ascontiguousarray((1 + 2 * place.astype(dtype)).T[order]),
+            scales=scales[order].astype(dtype, copy=False),
             order=order.astype(np.int32),
             shares=np.linspace(0, order.size, self._workers.count + 1).astype(np.int64))
         self._used = slice(column.min(), column.max() + len(self._kernel.lanes) // 2)
@@ -164,6 +169,22 @@ def _kernel(width, beta, dtype):
 
 def _lanes(width):
     return 16 if width <= 8 else 32
+
+
+def _stride(lengths):
+    """Distance of rows in reals; rows of 2^k cells would share cache lines."""
+    return 2 * (lengths[1] + 4)
+
+
+def memory_size(n_points, starts, counts, eps, dtype, workers):
+    """Number of reals in the grid and the private pieces of the workers, at most.
+
+    The pieces hold disjoint tiles of the rows, but for the halo of each.
+    """
+    width, _, lengths = _least_work(n_points, starts, counts, eps, dtype)
+    height = lengths[0] + 2 * (width // 2 + 1)
+    pieces = min((workers - 1) * height, height + (workers - 1) * (width + TILE_ROWS)) if workers > 1 else 0
+    return (height + pieces) * _stride(lengths)
 
 
 def _real_pairs(values):

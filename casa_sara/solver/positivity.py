@@ -7,6 +7,8 @@ the source at the longest baselines.  The lower bound of the pixels is lowered t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.ndimage import binary_dilation, maximum_filter
 
@@ -60,9 +62,10 @@ class Release:
 def _wanted(ppd, bounds):
     """Which pixels ask to be released; bool (nx, ny)."""
     weights = ppd.precond * ppd.spread
-    weights *= np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(weights.dtype)
+    weights *= np.repeat(bounds.noise_weights.astype(weights.dtype), np.diff(ppd.offsets))
     pixel = np.zeros_like(ppd.model)
     pixel[0, 0] = 1
-    noise_sq = ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(pixel))[0, 0]
+    noise_sq = float(ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(pixel))[0, 0])
+    del pixel
     gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)))
-    return (gradient < -SIGNIFICANT * np.sqrt(noise_sq)) & (ppd.model <= ppd.lowest)
+    return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest)

@@ -19,6 +19,7 @@ RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels 
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 USUAL = 9  # re-weightings that most data need
+SLAB = 64  # lines squared at a time
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
 
@@ -88,7 +89,8 @@ def band_noise(ppd, bounds, seed=20180404):
 
 
 def _rms(values):
-    return float(np.sqrt(np.mean(np.square(values, dtype=float))))
+    slabs = (values[start : start + SLAB] for start in range(0, len(values), SLAB))
+    return float(np.sqrt(sum(np.square(slab, dtype=float).sum() for slab in slabs) / values.size))
 
 
 def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False):
