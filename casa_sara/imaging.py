@@ -14,12 +14,15 @@ from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
+from casa_sara.deadline import Deadline
+from casa_sara.forecast import Pace, writing_seconds
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator
-from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
+from casa_sara.rehearsal import foresee
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT
 from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
 __all__ = ["Result", "make_image"]
@@ -27,6 +30,8 @@ __all__ = ["Result", "make_image"]
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
 MOST_NAMED = 20  # wild samples that the log names one by one
+MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
+REPORT_SECONDS = 30.0
 IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
 
 
@@ -35,7 +40,7 @@ class Result:
     """What one run found, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
-    from the data, in units of what the weights say.
+    from the data, in units of what the weights say; `forecast` is what was said of memory and time before.
     """
 
     data: Visibilities
@@ -44,17 +49,22 @@ class Result:
     reconstruction: Reconstruction | None
     residual_peak: float
     model_flux: float
+    forecast: dict
 
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-               output: Output) -> Result:
+               output: Output, limits: Limits = Limits()) -> Result:
     """Image a selection of MeasurementSets and write the products.
 
     Raises
     ------
+    MemoryError
+        The run would not fit; nothing large was allocated.
     ValueError, FileNotFoundError, RuntimeError
         For data or parameters that no image can be made of; the message names the task parameter.
     """
+    deadline, forecast = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
+    forecast.require(limits.maxmem_gb)
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
     data.notes.extend(_limits(data, grid))
@@ -71,7 +81,10 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
         density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
-        reconstruction = _solve(data, offsets, density, grid, options, noise, start)
+        deadline.reserve = _after_iterations(data, grid, output, limits, deadline.elapsed())
+        pace = Pace(schedule_of(options).expected_iterations)
+        reconstruction = _solve(data, offsets, density, grid, options, noise, start, deadline, pace)
+        forecast = replace(forecast, iteration_s=pace.seconds)
         model = reconstruction.model
         data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
@@ -87,7 +100,8 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         log.info("writing the model column")
         write_model_column(selection, data.phase_center, lambda uvw: MeasurementOperator(
             uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads).forward(model))
-    return Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
+    return Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)),
+                  forecast.summary())
 
 
 def _limits(data, grid):
@@ -105,20 +119,31 @@ def _limits(data, grid):
     return notes
 
 
-def _solve(data, offsets, density, grid, options, noise, start):
-    """Reconstruct, with progress in the log and Ctrl-C as the wish to stop."""
+def _after_iterations(data, grid, output, limits, read_s):
+    """Seconds to keep for what comes after the iterations: images, model column, report."""
+    column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
+    return writing_seconds(data.size, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
+
+
+def _solve(data, offsets, density, grid, options, noise, start, deadline, pace):
+    """Reconstruct, with progress in the log, Ctrl-C as the wish to stop, and the time as a limit."""
     progress = log.Progress()
     expected = schedule_of(options).expected_iterations
 
     def report(ppd, record):
+        if words := pace(ppd.iteration):
+            log.info(words)
         fraction = min(ppd.iteration / expected, 0.999)
         progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
                  f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
 
-    with stop_on_interrupt() as stopped:
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped)
+    with stop_on_interrupt() as pressed:
+        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
+                                     lambda: pressed() or deadline.near())
     progress.close()
     record = reconstruction.record
+    if record.stop_code == STOPPED_BY_USER and not pressed():
+        record.stop_code = TIME_LIMIT
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
     released = sum(update["released"] for update in record.reweightings)

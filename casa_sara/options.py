@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-__all__ = ["Comparing", "ImageGrid", "Output", "Selection", "SolverOptions", "Weighting"]
+__all__ = ["Comparing", "ImageGrid", "Limits", "Output", "Selection", "SolverOptions", "Weighting"]
 
 SARA_BASES = ("dirac", "db1", "db2", "db3", "db4", "db5", "db6", "db7", "db8")
 
@@ -100,6 +101,19 @@ class Output:
     restoringbeam: tuple[str, ...] | None = ()
     savemodel: str = "none"
     history: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the run may take; `report` tells whether a report is made after it, which takes its share.
+
+    `maxmem_gb` is the most that the process may hold, in 1e9 bytes, 0 for what the machine has; `maxtime_s` is infinite
+    where there is no limit.
+    """
+
+    maxmem_gb: float = 0.0
+    maxtime_s: float = math.inf
+    report: bool = False
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     startmodel : real (nx, ny), optional
         First image, Jy/pixel.
     progress, stopped : callable
-        See :func:`casa_sara.solver.reweighting.solve`.
+        See :func:`casa_sara.solver.reweighting.solve`; `stopped` ends the NNLS fit too, and one iteration follows.
 
     Returns
     -------
@@ -97,7 +97,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
         problem = _Problem.of(data, density, grid, options, unit_jy)
         # positivity and a vanishing sparsity alone: where the bounds start, and the model too
         first, residual = nnls(problem.measurement, problem.vis, problem.precond, problem.data_norm_sq,
-                               positivity=options.positivity)
+                               positivity=options.positivity, stopped=stopped)
         found = find_wild(data, offsets, residual, unit_jy * float(np.abs(first).sum(dtype=float)))
         if found.index.size == 0:
             break

@@ -27,10 +27,12 @@ ROOMS = {
     "tasks": {"casa_sara.private"},
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
     "private": {
-        "casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.resources", "casa_sara.solver",
+        "casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal", "casa_sara.resources",
+        "casa_sara.solver",
         "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
     },
     "interrupt": set(),
+    "deadline": set(),
     "resources": set(),
     "options": set(),
     "visibilities": {"numpy"},
@@ -47,7 +49,12 @@ ROOMS = {
 LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
+ROOMS["forecast"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
+ROOMS["rehearsal"] = {"casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", *NUMERICS}
+ROOMS["imaging"] = {
+    "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.interrupt", "casa_sara.rehearsal", "numpy",
+    *NUMERICS,
+}
 ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.jsonfile", "numpy", *NUMERICS}
 ROOMS["demo"] = {
     "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS,

@@ -63,6 +63,7 @@ def _sara(result, options, full):
         "notes": list(data.notes),
         "blocks": [_block(result, j) for j in range(len(result.blocks))],
         "nthreads": options.nthreads,
+        "forecast": dict(result.forecast),
     }
     if solved:
         record = solved.record

@@ -11,11 +11,12 @@ from casa_sara import jsonfile
 from casa_sara.casa import log
 from casa_sara.casa.modelcolumn import check_model_column_writable
 from casa_sara.casa.products import RECORD, REPORT, check_imagename, existing_products, history_lines
-from casa_sara.casa.quantities import radians
+from casa_sara.casa.quantities import radians, seconds
 from casa_sara.casa.restore import restoring_beam_words
 from casa_sara.imaging import make_image
-from casa_sara.options import Comparing, ImageGrid, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import Comparing, ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
 from casa_sara.private.summary import summary
+from casa_sara.rehearsal import rehearse
 from casa_sara.resources import available_cores
 
 __all__ = ["selection_of", "tsara"]
@@ -31,10 +32,13 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
                           tuple(parameters["uvtaper"]))
     options = _solver_options(parameters)
+    limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
+    if parameters["dryrun"]:
+        return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
     output = _output(parameters, grid)
     if output.savemodel == "modelcolumn":
         check_model_column_writable(selection)
-    result = make_image(selection, grid, weighting, options, output)
+    result = make_image(selection, grid, weighting, options, output, limits)
     jsonfile.save(output.imagename + RECORD, summary(result, options, full=True)["sara"])
     if parameters["report"]:
         _report(output.imagename, selection, options.nthreads)
@@ -83,6 +87,19 @@ def _cell_rad(value):
     if not 0 < size < 1:
         raise ValueError(f"cell = {value!r}: should be a positive angle, e.g. '0.1arcsec'")
     return size
+
+
+def _seconds(maxtime):
+    """The time limit in seconds, a number without unit being minutes; infinite where there is none."""
+    if maxtime == "":
+        return math.inf
+    try:
+        span = float(maxtime) * 60
+    except ValueError:
+        return seconds(maxtime, "maxtime")
+    if not 0 < span < math.inf:
+        raise ValueError(f"maxtime = {maxtime!r}: should be a positive number of minutes, or a time as '2h'; '' sets no limit")
+    return span
 
 
 def _solver_options(parameters):

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 __all__ = ["CONVERGED", "DIVERGED", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER", "STOP_DESCRIPTIONS",
-           "SolverRecord", "UNFEASIBLE"]
+           "SolverRecord", "TIME_LIMIT", "UNFEASIBLE"]
 
 CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, DIVERGED, UNFEASIBLE = 101, 102, 103, 104, 105, 106
+TIME_LIMIT = 107
 STOP_DESCRIPTIONS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "iteration limit",
@@ -17,6 +18,7 @@ STOP_DESCRIPTIONS = {
     STOPPED_BY_USER: "stopped by user",
     DIVERGED: "diverged",
     UNFEASIBLE: "converged, but the data do not fit the bounds",
+    TIME_LIMIT: "time limit",
 }
 
 

@@ -54,7 +54,12 @@ class Schedule:
     @property
     def expected_iterations(self) -> int:
         """A guess of how many iterations it takes, for the progress."""
-        return min(self.niter, (min(self.nreweights, USUAL) + 3) * self.interval)
+        return min(self.niter, (self.expected_reweightings + 3) * self.interval)
+
+    @property
+    def expected_reweightings(self) -> int:
+        """A guess of how many re-weightings it takes."""
+        return min(self.nreweights, USUAL)
 
 
 def band_noise(ppd, bounds, seed=20180404):

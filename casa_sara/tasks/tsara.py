@@ -49,6 +49,9 @@ PARAMETERS = (
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
     Parameter('blocks', ('int',), 0, 'Number of data blocks, each with its own bound; 0: one per snapshot', minimum=0.0),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0),
+    Parameter('dryrun', ('bool',), False, 'Only say what the run would take: memory and time'),
+    Parameter('maxmem', ('double',), 0.0, 'Most memory to use, in GB; 0: what the machine has available', minimum=0.0),
+    Parameter('maxtime', ('string', 'int', 'double'), '', "Longest time to take, as '2h', or in minutes; '': no limit"),
     Parameter('fullsummary', ('bool',), False, 'Return dictionary with complete convergence history'),
     Parameter('report', ('bool',), False, 'Write a report of the run, imagename.report/report.html'),
     Parameter('restart', ('bool',), False, 'Continue from imagename.model'),
@@ -337,6 +340,24 @@ class _tsara:
     nthreads : int, default 0
         Threads for the Fourier and wavelet transforms.
 
+    dryrun : bool, default False
+        True reads the data, times a few calls of the real operators on them, logs a table and returns
+        the forecast: memory by part, whether it fits, seconds of an iteration and of the whole run.
+        Nothing is written. Without it the first lines of the log tell the memory, and the line
+        after the first iterations the time.
+
+    maxmem : float, default 0.0
+        A run that would hold more than this (1 GB = 1e9 bytes, Python and CASA included) is refused
+        before it begins, with the sizes that would fit. 0 takes what the machine and the control
+        groups of the process leave.
+
+    maxtime : str or int or float, default ''
+        The iterations end early enough for the images to be written in time, and the best image so
+        far is the result, with stop code 107. Reading the data and at least 10 iterations of the
+        first fit are always done.
+        Examples: maxtime='90min'
+                  maxtime=30    (minutes)
+
     fullsummary : bool, default False
         True returns every iteration in the record 'sara' of the returned dictionary; False the
         state at each re-weighting and at the end.
@@ -366,7 +387,7 @@ class _tsara:
     dict
       As tclean's: iterdone, niter, nmajordone, stopcode, stopDescription, summarymajor,
       summaryminor. Stop codes: 101 converged, 102 iteration limit, 103 noise only, 104 stopped by
-      user, 105 diverged, 106 converged but the data do not fit the bounds. The key 'sara' holds its own record: the
+      user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit. The key 'sara' holds its own record: the
       bound of each block with its snapshot, the history of re-weightings and iterations, the
       parameters that were chosen automatically and why, and how many samples were dropped for
       which reason.
@@ -404,8 +425,8 @@ class _tsara:
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
         precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
         l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003,
-        regscale=1.0, blocks=0, nthreads=0, fullsummary=False, report=False, restart=False, overwrite=False,
-        savemodel='none', parallel=False,
+        regscale=1.0, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False,
+        restart=False, overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())
