@@ -90,7 +90,7 @@ class Workload:
 
     def _grid(self):
         reach = [min(max(wave * cell, 1e-6), 0.5) for wave, cell in zip(self.reach, self.cell_rad)]
-        return grid_bytes(self.samples, reach, self.shape, nthreads=self.nthreads)
+        return grid_bytes(self.samples, reach, self.shape)
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def _decimations(shape, reach, eps, dtype):
     return [AxisDecimation(size, band, eps, precision) for size, band in zip(shape, bands)]
 
 
-def grid_bytes(size, reach, shape, eps=1e-6, dtype=np.float32, nthreads=1):
+def grid_bytes(size, reach, shape, eps=1e-6, dtype=np.float32):
     """Memory of an operator but for what it keeps of each visibility: its grid, and the decimated image.
 
     Parameters
@@ -135,7 +135,7 @@ def grid_bytes(size, reach, shape, eps=1e-6, dtype=np.float32, nthreads=1):
         Number of visibilities M.
     reach : (float, float)
         Largest |u|·cell and |v|·cell, in cycles per pixel.
-    shape, eps, dtype, nthreads
+    shape, eps, dtype
         As of the operator.
 
     Returns
@@ -144,7 +144,7 @@ def grid_bytes(size, reach, shape, eps=1e-6, dtype=np.float32, nthreads=1):
     """
     axes = _decimations(shape, reach, eps / 2, np.dtype(dtype))
     starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
-    cells = memory_size(size, starts, counts, eps / 2, dtype, nthreads)
+    cells = memory_size(size, starts, counts, eps / 2, dtype)
     return np.dtype(dtype).itemsize * (cells + counts[0] * shape[1])
 
 
