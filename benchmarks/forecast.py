@@ -23,7 +23,7 @@ from casa_sara import tsara
 
 vis, nx, ny = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
 common = dict(vis=vis, imagename=vis + ".image", imsize=[nx, ny], cell="0.04arcsec", datacolumn="data", nthreads=1,
-              reweightdecay=0.3, niter=95)
+              reweightdecay=0.3, niter=125)
 if len(sys.argv) > 4:
     print(json.dumps(tsara(dryrun=True, **common)["forecast"]))
 else:

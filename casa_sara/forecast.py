@@ -32,6 +32,7 @@ LIBRARIES = 90_000_000  # compiled code and libraries that come with the first r
 REPORT = 250_000_000  # of drawing, and REPORT_PLANES of each image
 REPORT_PLANES = 30
 # seconds
+STARTING = 5.0  # libraries, compiled code, image plane
 WRITE_BASE, WRITE_SAMPLE, WRITE_PIXEL = 1.0, 6e-7, 2.5e-7
 MARGIN = 2.0  # on these: disks differ
 NORM_PAIRS = 60  # Φ and Φ† for ‖Φ‖, in all
@@ -244,10 +245,10 @@ class Timing:
     def total(self) -> float:
         """Seconds of the run."""
         if not self.iterations:
-            return self.reading + self.building + self.writing
+            return STARTING + self.reading + self.building + self.writing
         solving = (self.iterations + REWEIGHTING * self.reweightings) * self.iteration
         first = NORM_PAIRS * self.pair + NNLS_ITERATIONS * self.nnls_iteration
-        return self.reading + self.building + first + solving + self.writing
+        return STARTING + self.reading + self.building + first + solving + self.writing
 
 
 def measure(data, offsets, grid, options, reading):

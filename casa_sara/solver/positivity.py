@@ -63,9 +63,8 @@ def _wanted(ppd, bounds):
     """Which pixels ask to be released; bool (nx, ny)."""
     weights = ppd.precond * ppd.spread
     weights *= np.repeat(bounds.noise_weights.astype(weights.dtype), np.diff(ppd.offsets))
-    pixel = np.zeros_like(ppd.model)
-    pixel[0, 0] = 1
-    noise_sq = float(ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(pixel))[0, 0])
-    del pixel
-    gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)))
+    image = np.zeros_like(ppd.model)
+    image[0, 0] = 1
+    noise_sq = float(ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(image), image)[0, 0])
+    gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)), image)
     return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest)
