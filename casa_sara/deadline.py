@@ -34,7 +34,7 @@ class Deadline:
         return self._clock() - self._begin
 
     def near(self) -> bool:
-        """Whether to stop now: asked after every iteration, as another one would take as long as since the last call."""
+        """Whether to stop now; asked after every iteration, another one is taken to last as long as since then."""
         now = self._clock()
         lap, self._last = now - self._last, now
         return now + lap + self.reserve >= self._end

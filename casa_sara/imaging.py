@@ -15,7 +15,6 @@ from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
 from casa_sara.deadline import Deadline
-from casa_sara.forecast import Pace, writing_seconds
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator
@@ -23,6 +22,7 @@ from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOption
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT
+from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
 __all__ = ["Result", "make_image"]

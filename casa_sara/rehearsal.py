@@ -7,8 +7,9 @@ import time
 from casa_sara.casa import log
 from casa_sara.casa.census import take_census
 from casa_sara.casa.ms import read_visibilities
-from casa_sara.forecast import Workload, forecast, measure
+from casa_sara.forecast import Workload, forecast
 from casa_sara.resources import available_memory, resident_memory
+from casa_sara.timing import measure
 from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
 
 __all__ = ["foresee", "rehearse"]
@@ -35,7 +36,9 @@ def foresee(selection, grid, options, limits):
 
 
 def rehearse(selection, grid, options, blocks, limits):
-    """Say what a run would take: memory by part and, where it fits, time from a short measurement; nothing is written.
+    """Say what a run would take: memory by part and, where it fits, time from a short measurement.
+
+    Nothing is written.
 
     Parameters
     ----------
@@ -73,7 +76,7 @@ def rehearse(selection, grid, options, blocks, limits):
 def _time_lines(timing):
     """The times as lines of a table."""
     yield f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations (the data decide)"
-    rows = {"reading": timing.reading, "building the operator": timing.building, "one iteration of NNLS": timing.nnls_iteration,
-            "one iteration": timing.iteration, "writing the images": timing.writing}
+    rows = {"reading": timing.reading, "building the operator": timing.building,
+            "one iteration of NNLS": timing.nnls_iteration, "one iteration": timing.iteration, "writing the images": timing.writing}
     for name, seconds in rows.items():
         yield f"  {name:<26}{seconds:10.3f} s"

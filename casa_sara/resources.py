@@ -27,8 +27,9 @@ def available_cores() -> int:
 def available_memory() -> int:
     """Bytes that this process may take in addition to what it has.
 
-    The least of what the kernel reckons available on the machine and of what is left in each control group, version 1 or 2,
-    that the process is in; files in a group's cache do not count as used.  Where the kernel tells nothing it is all memory.
+    The least of what the kernel reckons available on the machine and of what is left in each control group, version 1
+    or 2, that the process is in; files in a group's cache do not count as used.  Where the kernel tells nothing it is
+    all memory.
     """
     return max(0, min([_machine_memory(), *(_group_memory(*group) for group in _memory_groups())]))
 
@@ -63,7 +64,8 @@ def _memory_groups() -> Iterator[tuple[Path, str, str, str]]:
         if controllers == "":
             root, names = _CGROUPS, ("memory.max", "memory.current", "inactive_file")
         elif "memory" in controllers.split(","):
-            root, names = _CGROUPS / "memory", ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+            root = _CGROUPS / "memory"
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
         else:
             continue
         inner = Path(path.strip("/"))  # inside a container the path may be that of the world outside

@@ -49,11 +49,12 @@ ROOMS = {
 LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["forecast"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
-ROOMS["rehearsal"] = {"casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", *NUMERICS}
+ROOMS["forecast"] = {"casa_sara.operators"}
+ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
+ROOMS["rehearsal"] = {"casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", *NUMERICS}
 ROOMS["imaging"] = {
-    "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.interrupt", "casa_sara.rehearsal", "numpy",
-    *NUMERICS,
+    "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.interrupt", "casa_sara.rehearsal", "casa_sara.timing",
+    "numpy", *NUMERICS,
 }
 ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.jsonfile", "numpy", *NUMERICS}
 ROOMS["demo"] = {

@@ -36,7 +36,8 @@ def seconds(text, parameter):
 
         value = casatools.quanta().convert(text, "s")["value"]
     if not 0 < value < math.inf:
-        raise ValueError(f"{parameter} = '{text}' is not a time: it takes a positive number with its unit, as '2h' or '90min'")
+        right = "a positive number with its unit, as '2h' or '90min'"
+        raise ValueError(f"{parameter} = '{text}' is not a time: it takes {right}")
     return value
 
 

@@ -10,8 +10,9 @@ transformed, and interpolated with the kernel at (f_m, g_m).  Its aliases set th
 width of the kernel and padding are chosen for the least work at the accuracy asked for.
 
 Cell numbers and fractions of a cell are kept apart, so that in single precision the error
-does not grow with the size of the image.  All memory is allocated once.  The points are spread to the grid in pieces whose
-number depends on that of the points alone, so that results are the same, to the last bit, for any number of threads.
+does not grow with the size of the image.  All memory is allocated once.  The points are spread to the grid in
+pieces whose number depends on that of the points alone, so that results are the same, to the last bit, for any number
+of threads.
 """
 
 from __future__ import annotations

@@ -98,7 +98,8 @@ def _seconds(maxtime):
     except ValueError:
         return seconds(maxtime, "maxtime")
     if not 0 < span < math.inf:
-        raise ValueError(f"maxtime = {maxtime!r}: should be a positive number of minutes, or a time as '2h'; '' sets no limit")
+        raise ValueError(f"maxtime = {maxtime!r}: should be a positive number of minutes, or a time as '2h'; "
+                         "'' sets no limit")
     return span
 
 
