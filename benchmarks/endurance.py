@@ -31,7 +31,7 @@ SKY = [(1.0, -24 * CELL_RAD, 14 * CELL_RAD), (0.4, 18 * CELL_RAD, -20 * CELL_RAD
 OBSERVATION = dict(configuration="c", antennas=27, sky=SKY, noise=0.05, scans=4, scan_seconds=240.0, integration=20.0,
                    spacing_seconds=5400.0, hour_angle=-2.5)  # 50 544 visibilities
 GRID = dict(imsize=128, cell="0.5arcsec", datacolumn="data", overwrite=True)
-FOREVER = dict(reltol=0.0, finalreltol=0.0, reweighttol=0.0)
+FOREVER = dict(reltol=0.0, reweighttol=0.0, reweightdecay=1.0, nreweights=10**6)
 
 
 def open_files():
@@ -70,12 +70,11 @@ def long_solution(vis, iterations):
     from casa_sara.casa.ms import read_visibilities
     from casa_sara.options import ImageGrid, Selection, SolverOptions
     from casa_sara.reconstruction import reconstruct
-    from casa_sara.solver import reweighting
     from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
 
     data = read_visibilities(Selection((vis,), datacolumn="data"))
     data, offsets = sort_into_blocks(data, snapshot_blocks(data)[0])
-    grid, options = ImageGrid((128, 128), (CELL_RAD, CELL_RAD)), SolverOptions(niter=iterations, nreweights=10**6, **FOREVER)
+    grid, options = ImageGrid((128, 128), (CELL_RAD, CELL_RAD)), SolverOptions(niter=iterations, **FOREVER)
     memory, files = [], []
 
     def watch(ppd, record):
@@ -83,11 +82,7 @@ def long_solution(vis, iterations):
             memory.append(resident_memory())
             files.append(open_files())
 
-    scale, reweighting.LAST_SCALE = reweighting.LAST_SCALE, 0.0  # re-weighting for ever
-    try:
-        record = reconstruct(data, offsets, np.ones(data.size), grid, options, progress=watch).record
-    finally:
-        reweighting.LAST_SCALE = scale
+    record = reconstruct(data, offsets, np.ones(data.size), grid, options, progress=watch).record
     start = len(memory) // 10
     per_step = growth(memory[start:]) * 1000 / max(1, iterations // 200)
     return per_step, record.iteration[-1], files[-1] - files[start]
