@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from casa_sara.casa import log
-from casa_sara.casa.imageplane import define_image_plane
+from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
 from casa_sara.casa.modelcolumn import write_model_column
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
+from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.noise import noise_from_differences
@@ -47,8 +49,15 @@ class Result:
 
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-               output: Output) -> Result:
+               output: Output, record: Callable[[Result], dict] | None = None) -> Result:
     """Image a selection of MeasurementSets and write the products.
+
+    Parameters
+    ----------
+    selection, grid, weighting, options, output
+        What the task was asked for.
+    record : callable, optional
+        Returns what is kept beside the images of the result.
 
     Raises
     ------
@@ -62,6 +71,9 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         log.warn(note)
     plane = define_image_plane(data, selection, grid)
     start = read_model(output.startmodel, plane) if output.startmodel else None
+    if output.images_stand:
+        _save_model(selection, data, grid, options, start)
+        return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)))
     # split and weigh
     block_of_sample, blocks = snapshot_blocks(data, output.blocks)
     data, offsets = sort_into_blocks(data, block_of_sample)
@@ -81,13 +93,24 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     beam = fit_beam(psf, plane)
     residual = dirty_image(operator, data.vis - operator.forward(model), weights)
     images = dict(psf=psf, residual=residual, model=model)
-    write_products(output.imagename, plane, images, sum_of_weights(data, selection, weights), beam,
-                   output.restoringbeam, output.history)
+    result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
+    write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result))
     if output.savemodel == "modelcolumn":
-        log.info("writing the model column")
-        write_model_column(selection, data.phase_center, lambda uvw: MeasurementOperator(
-            uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads).forward(model))
-    return Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
+        _save_model(selection, data, grid, options, model)
+    return result
+
+
+def _save_model(selection, data, grid, options, model):
+    """Write the model's visibilities into the MeasurementSets: the last phase, the images are whole."""
+    log.info("writing the model column")
+    write_model_column(selection, data.phase_center, lambda uvw: MeasurementOperator(
+        uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads).forward(model))
+
+
+def _peak(name):
+    """Return the largest absolute pixel of an image that stands."""
+    with opened("image", name) as ia:
+        return float(np.abs(read_pixels(ia)).max())
 
 
 def _limits(data, grid):

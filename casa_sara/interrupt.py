@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-__all__ = ["stop_on_interrupt"]
+__all__ = ["signals_deferred", "stop_on_interrupt"]
 
 
 @contextmanager
@@ -31,3 +31,21 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         yield pressed.is_set
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def signals_deferred() -> Iterator[None]:
+    """Hold back SIGINT and SIGTERM, and deliver them at the end. Only the main thread can."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    received = []
+    deferred = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.signal(number, lambda *got: received.append(got[0])) for number in deferred}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        for number in received:
+            signal.raise_signal(number)

@@ -92,6 +92,7 @@ class Output:
     """Where results go, and what goes along.
 
     `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image.
+    With `images_stand` the products of an earlier run stay as they are, and only the model column is written.
     """
 
     imagename: str
@@ -99,6 +100,7 @@ class Output:
     blocks: int = 0
     restoringbeam: tuple[str, ...] | None = ()
     savemodel: str = "none"
+    images_stand: bool = False
     history: tuple[str, ...] = ()
 
 

@@ -193,7 +193,7 @@ def test_writable_check(copied, monkeypatch):
     check_model_column_writable(selection)
     usage = shutil.disk_usage(copied)
     cells = 8 * sum(spectral_window(copied, "DATA", number).size for number in (0, 1))
-    for free, enough in ((int(cells * 1.06), True), (int(cells * 1.04), False)):
+    for free, enough in ((int(cells * 1.06) + 200_000, True), (int(cells * 1.04) + 200_000, False)):
         monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=free))
         if enough:
             check_model_column_writable(selection)

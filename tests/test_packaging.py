@@ -36,7 +36,7 @@ ROOMS = {
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
     "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
-    "casa": {"casa_sara", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
+    "casa": {"casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
     "operators": {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },

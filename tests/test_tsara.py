@@ -196,8 +196,8 @@ def test_a_failed_run_leaves_the_old_products(run, vis, tmp_path, monkeypatch):
     for product in PRODUCTS:
         shutil.copytree(f"{run[1]}.{product}", f"{name}.{product}")
     before = _hashes(tmp_path)
-    monkeypatch.setattr("casa_sara.casa.products.restore", lambda *args: (_ for _ in ()).throw(RuntimeError("no space")))
-    with pytest.raises(RuntimeError, match="no space"):
+    monkeypatch.setattr("casa_sara.imaging.sum_of_weights", lambda *args: "not a number")
+    with pytest.raises(ValueError, match="not a number"):
         tsara(vis=vis, imagename=name, overwrite=True, niter=0, **GRID)
     assert _hashes(tmp_path) == before
 

@@ -2,28 +2,35 @@
 
 This is the only place where a user's MeasurementSet is changed, so it comes last in a run
 and is checked before: `check_model_column_writable` can be called before hours are spent.
+
+While a column is written the file MODEL_DATA.incomplete stands in its MeasurementSet, to which
+CASA pays no attention. A run that is killed leaves it there.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
-import signal
-import threading
+import socket
 import zlib
-from contextlib import contextmanager
+from datetime import datetime, timezone
+from pathlib import Path
 
 import numpy as np
 
+from casa_sara.casa.child import ChildError, in_child
 from casa_sara.casa.frames import Geometry
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
+from casa_sara.interrupt import signals_deferred
 
-__all__ = ["check_model_column_writable", "write_model_column"]
+__all__ = ["INCOMPLETE", "add_column", "check_model_column_writable", "incomplete_columns", "write_model_column"]
 
+INCOMPLETE = "MODEL_DATA.incomplete"
 _COLUMN = "MODEL_DATA"
 _CHUNK = 1_000_000  # visibilities predicted at a time
-_SPARE = 1.05  # of the disk space computed
+_SPARE, _OVERHEAD = 1.05, 200_000  # of the disk space computed; bytes for the table's description, locks and the mark
 
 
 def check_model_column_writable(selection):
@@ -53,12 +60,22 @@ def check_model_column_writable(selection):
         bytes_so_far, _ = needed.get(device, (0, None))
         needed[device] = bytes_so_far + _column_bytes(ms.name), ms.name
     for count, name in needed.values():
-        free = shutil.disk_usage(name).free
-        if count * _SPARE > free:
-            raise OSError(
-                f"savemodel = 'modelcolumn' needs {count * _SPARE / 1e9:.2f} GB for {_COLUMN}, but the disk of "
-                f"'{name}' has {free / 1e9:.2f} GB left: free some, or set savemodel = 'none'"
-            )
+        _check_space(name, count)
+
+
+def _check_space(name, count):
+    """Raise unless the disk of a MeasurementSet has room for columns to be added, of so many bytes."""
+    needed, free = count and count * _SPARE + _OVERHEAD, shutil.disk_usage(name).free
+    if needed > free:
+        raise OSError(
+            errno.ENOSPC, f"savemodel = 'modelcolumn' needs {needed / 1e6:.1f} MB for {_COLUMN}, but the disk of "
+            f"'{name}' has {free / 1e6:.1f} MB left: free some, or set savemodel = 'none'"
+        )
+
+
+def incomplete_columns(vis):
+    """Return which of these MeasurementSets hold a model column that a killed run left half written."""
+    return [name for name in vis if os.path.exists(os.path.join(name, INCOMPLETE))]
 
 
 def _column_bytes(name):
@@ -94,21 +111,67 @@ def write_model_column(selection, phase_center, predict):
 
     Raises
     ------
+    OSError
+        The disk has no room for the column; the MeasurementSet is as it was.
     RuntimeError
         When what is read back is not what was written.
     """
     for ms in select_data(selection)[0]:
-        with _signals_deferred():
+        with signals_deferred():
+            _mark(ms.name)
             _make_column(ms.name)
             written = _write(ms, Geometry(ms, phase_center), predict)
             if written != [_checksum(values) for values in _read_back(ms)]:
                 raise RuntimeError(f"{_COLUMN} of '{ms.name}' does not read back as it was written: do not use it")
+            os.unlink(os.path.join(ms.name, INCOMPLETE))
+
+
+def _mark(name):
+    """Say in the MeasurementSet that its model column is not to be used."""
+    since = datetime.now(timezone.utc).isoformat(" ", "seconds")
+    Path(name, INCOMPLETE).write_text(
+        f"Process {os.getpid()} on {socket.gethostname()} began to write {_COLUMN} at {since}. Where it has ended, the column "
+        "is incomplete: tsara with restart=True, niter=0, savemodel='modelcolumn' writes it anew.\n", encoding="utf-8")
 
 
 def _make_column(name):
-    """Delete a model in the header; add the column where it is missing."""
+    """Delete a model in the header; add the column where it is missing.
+
+    That takes disk space, so a child process does it, which may fail without harm: until the column stands whole, the
+    description of the table is the old one, and new files beside it belong to nothing. Only where this
+    process holds the MeasurementSet open elsewhere, a child would wait for it forever, and it is done here.
+    """
+    before, description = set(os.listdir(name)), Path(name, "table.dat").read_bytes()
+    missing = _column_bytes(name)
+    try:
+        _check_space(name, missing)
+        if _held_open(name):
+            add_column(name)
+        else:
+            in_child("column", name=name)
+    except (ChildError, OSError) as error:
+        if missing and Path(name, "table.dat").read_bytes() == description:
+            for file in set(os.listdir(name)) - before:
+                os.unlink(os.path.join(name, file))
+            os.unlink(os.path.join(name, INCOMPLETE))
+        if isinstance(error, OSError):
+            raise
+        raise OSError(errno.ENOSPC if "No space" in str(error) else errno.EIO,
+                      f"savemodel = 'modelcolumn': {_COLUMN} could not be added to '{name}': {error}") from error
+
+
+def add_column(name):
+    """Delete a model in the header; add the column where it is missing, filled with 1."""
     with opened("calibrater", name, addcorr=False, addmodel=True) as cb:
         cb.delmod(otf=True, scr=False)
+
+
+def _held_open(name):
+    """Return whether this process has files of a MeasurementSet open, as far as the system tells."""
+    folder, files = os.path.realpath(name) + os.sep, "/proc/self/fd"
+    if not os.path.isdir(files):
+        return True
+    return any(os.path.realpath(os.path.join(files, file)).startswith(folder) for file in os.listdir(files))
 
 
 def _pieces(ms):
@@ -172,21 +235,3 @@ def _read_back(ms):
 def _checksum(values):
     """Return the CRC of complex values in the column's single precision."""
     return zlib.crc32(np.asfortranarray(values, dtype=np.complex64).tobytes(order="F"))
-
-
-@contextmanager
-def _signals_deferred():
-    """Hold back SIGINT and SIGTERM, and deliver them at the end. Only the main thread can."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    received = []
-    deferred = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda *got: received.append(got[0])) for number in deferred}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for number in received:
-            signal.raise_signal(number)

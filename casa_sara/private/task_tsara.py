@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import casa_sara
-from casa_sara import jsonfile
 from casa_sara.casa import log
-from casa_sara.casa.modelcolumn import check_model_column_writable
-from casa_sara.casa.products import RECORD, REPORT, check_imagename, existing_products, history_lines
+from casa_sara.casa.lock import one_run_of
+from casa_sara.casa.modelcolumn import check_model_column_writable, incomplete_columns
+from casa_sara.casa.products import REPORT, check_imagename, existing_products, history_lines, recover_products
 from casa_sara.casa.quantities import radians
 from casa_sara.casa.restore import restoring_beam_words
 from casa_sara.imaging import make_image
@@ -31,14 +31,27 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
                           tuple(parameters["uvtaper"]))
     options = _solver_options(parameters)
-    output = _output(parameters, grid)
-    if output.savemodel == "modelcolumn":
-        check_model_column_writable(selection)
-    result = make_image(selection, grid, weighting, options, output)
-    jsonfile.save(output.imagename + RECORD, summary(result, options, full=True)["sara"])
-    if parameters["report"]:
-        _report(output.imagename, selection, options.nthreads)
+    check_imagename(parameters["imagename"], grid.shape)
+    with one_run_of(parameters["imagename"]):
+        recover_products(parameters["imagename"])
+        output = _output(parameters)
+        if output.savemodel == "modelcolumn":
+            check_model_column_writable(selection)
+        _warn_of_incomplete(selection.vis, output)
+        result = make_image(selection, grid, weighting, options, output,
+                            lambda result: summary(result, options, full=True)["sara"])
+        if parameters["report"]:
+            _report(output.imagename, selection, options.nthreads)
     return summary(result, options, parameters["fullsummary"])
+
+
+def _warn_of_incomplete(vis, output):
+    """Point out model columns that a killed run left half written, unless this run writes them."""
+    if output.savemodel == "modelcolumn":
+        return
+    for name in incomplete_columns(vis):
+        log.warn(f"MODEL_DATA of '{name}' is incomplete, a run was killed while it wrote it: calibrate with it only after "
+                 "tsara(…, restart=True, niter=0, savemodel='modelcolumn') has written it anew")
 
 
 def _report(imagename, selection, nthreads):
@@ -96,10 +109,9 @@ def _solver_options(parameters):
     return SolverOptions(nthreads=parameters["nthreads"] or available_cores(), **values)
 
 
-def _output(parameters, grid):
+def _output(parameters):
     imagename = parameters["imagename"]
     startmodel = parameters["startmodel"]
-    check_imagename(imagename, grid.shape)
     old = existing_products(imagename)
     if parameters["restart"]:
         if startmodel:
@@ -112,5 +124,6 @@ def _output(parameters, grid):
         raise FileExistsError(f"imagename = '{imagename}': {', '.join(old)} exist; choose another name, "
                               "overwrite = True to replace them, or restart = True to continue from the model")
     beam = tuple(restoring_beam_words(parameters["restoringbeam"])) if parameters["restoration"] else None
-    return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"],
+    images_stand = parameters["restart"] and parameters["niter"] == 0 and parameters["savemodel"] == "modelcolumn"
+    return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"], images_stand,
                   tuple(history_lines("tsara", parameters)))
