@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
 from casa_sara.casa import log
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
-from casa_sara.casa.modelcolumn import write_model_column
+from casa_sara.casa.modelcolumn import save_model_column, write_model_column
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
@@ -24,7 +24,7 @@ from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
 from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
-__all__ = ["Result", "make_image"]
+__all__ = ["Result", "make_image", "write_column"]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
@@ -103,8 +103,15 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
 def _save_model(selection, data, grid, options, model):
     """Write the model's visibilities into the MeasurementSets: the last phase, the images are whole."""
     log.info("writing the model column")
-    write_model_column(selection, data.phase_center, lambda uvw: MeasurementOperator(
-        uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads).forward(model))
+    save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
+                      cell_rad=grid.cell_rad, nthreads=options.nthreads, model=model)
+
+
+def write_column(selection, phase_center, cell_rad, nthreads, model):
+    """Predict the visibilities of a model and write them: what `save_model_column` has a child process do."""
+    chosen = {name: tuple(value) if isinstance(value, list) else value for name, value in selection.items()}
+    write_model_column(Selection(**chosen), phase_center, lambda uvw: MeasurementOperator(
+        uvw[:2], cell_rad, model.shape, eps=IMAGE_EPS, nthreads=nthreads).forward(model))
 
 
 def _peak(name):

@@ -12,7 +12,7 @@ pytest.importorskip("casatools")
 from simulated_ms import CYGNUS_A, add_column, column, direction_cosines, edit, simulate  # noqa: E402
 
 from casa_sara.casa import modelcolumn  # noqa: E402
-from casa_sara.casa.modelcolumn import check_model_column_writable, write_model_column  # noqa: E402
+from casa_sara.casa.modelcolumn import check_model_column_writable, save_model_column, write_model_column  # noqa: E402
 from casa_sara.casa.ms import read_visibilities  # noqa: E402
 from casa_sara.options import Selection  # noqa: E402
 
@@ -161,6 +161,20 @@ def test_a_model_in_the_header_is_deleted(tmp_path):
     assert in_header()
     write(name)
     assert not in_header()
+
+
+def test_a_measurement_set_that_is_open_in_the_session(copied):
+    """A child process would wait for this tool for ever: this process writes."""
+    import casatools
+
+    tb = casatools.table()
+    tb.open(str(copied))
+    try:
+        assert tb.getcol("SCAN_NUMBER").any()
+        save_model_column([str(copied)], lambda name: write(name), name=copied)
+    finally:
+        tb.close()
+    np.testing.assert_allclose(spectral_window(copied, "MODEL_DATA", 0), spectral_window(copied, "DATA", 0), atol=2e-6)
 
 
 def test_wrong_read_back_is_an_error(copied, monkeypatch):

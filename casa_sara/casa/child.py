@@ -14,13 +14,14 @@ import signal
 import subprocess
 import sys
 import threading
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 __all__ = ["ChildError", "in_child"]
 
-JOBS = {"products": ("casa_sara.casa.products", "write_images"), "column": ("casa_sara.casa.modelcolumn", "add_column")}
+JOBS = {"products": ("casa_sara.casa.products", "write_images"), "column": ("casa_sara.imaging", "write_column")}
 # sys.path comes along; the folder that Python puts first is the user's, whose files may have the names of modules
 _START = "import sys; sys.path[:] = sys.argv[1:]; del sys.argv[1:]; from casa_sara.casa.child import main; main()"
 
@@ -30,7 +31,7 @@ class ChildError(RuntimeError):
 
 
 def in_child(job: str, **arguments: Any) -> None:
-    """Do one of `JOBS` in a child process, which a Ctrl-C of the terminal does not reach.
+    """Do one of `JOBS` in a child process. It ends when this one does; a Ctrl-C of the terminal does not reach it.
 
     Parameters
     ----------
@@ -50,18 +51,21 @@ def in_child(job: str, **arguments: Any) -> None:
     reader = threading.Thread(target=lambda: said.append(child.stdout.read()), daemon=True)
     reader.start()
     try:
-        with child.stdin as stream:
-            stream.write(header)
-            for array in arrays:
-                stream.write(array.reshape(-1).view(np.uint8).data)
+        child.stdin.write(header)
+        for array in arrays:
+            child.stdin.write(array.reshape(-1).view(np.uint8).data)
+        child.stdin.flush()
+        child.wait()
     except BrokenPipeError:
-        pass  # it ended early, and says why
+        child.wait()  # it ended early, and says why
     except BaseException:
         child.kill()
+        child.wait()
         raise
     finally:
-        child.wait()
         reader.join()
+        with suppress(BrokenPipeError):
+            child.stdin.close()
         child.stdout.close()
     if child.returncode:
         raise ChildError(_last_words(said[0].decode(errors="replace"), child.returncode))
@@ -114,4 +118,12 @@ def main() -> None:
     stream = sys.stdin.buffer
     request = json.loads(stream.readline())
     module, function = JOBS[request["job"]]
-    getattr(importlib.import_module(module), function)(**_unpacked(request["arguments"], stream))
+    arguments = _unpacked(request["arguments"], stream)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    getattr(importlib.import_module(module), function)(**arguments)
+
+
+def _end_with_parent():
+    """End this process when its input does: that happens when the parent is killed."""
+    if not os.read(sys.stdin.fileno(), 1):
+        os._exit(1)

@@ -56,8 +56,8 @@ def _take(path, imagename):
         try:
             _lock(handle, imagename)
             if os.fstat(handle).st_size and not _said(handle):
-                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is no lock of tsara and in its way; "
-                                      "move it, or choose another name")
+                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is no lock of tsara and in its "
+                                      "way; move it, or choose another name")
             if _stands(handle, path):
                 return handle
         except BaseException:
@@ -88,8 +88,8 @@ def _lock(handle, imagename):
     except OSError as error:
         if error.errno not in _WITHOUT_LOCKS:
             raise
-        log.warn(f"imagename = '{imagename}': the file system has no locks ({error.strerror}): do not start another run "
-                 "under this name")
+        log.warn(f"imagename = '{imagename}': the file system has no locks ({error.strerror}): do not start another "
+                 "run under this name")
 
 
 def _said(handle):

@@ -183,8 +183,8 @@ def _not_written(imagename, shape, scratch, error):
     written = sum(os.lstat(os.path.join(parent, name)).st_blocks * 512
                   for parent, _, names in os.walk(scratch) for name in names)
     if free + written < needed:
-        return OSError(errno.ENOSPC, f"imagename = '{imagename}': '{folder}' filled up while the images were written: of "
-                       f"{needed / 1e6:.1f} MB they had {written / 1e6:.1f} MB, and {free / 1e6:.1f} MB are left; free some")
+        return OSError(errno.ENOSPC, f"imagename = '{imagename}': '{folder}' filled up while the images were written: "
+                       f"of {needed / 1e6:.1f} MB they had {written / 1e6:.1f} MB, and {free / 1e6:.1f} MB are left")
     return OSError(errno.EIO, f"imagename = '{imagename}': the images could not be written in '{folder}': {error}")
 
 

@@ -50,8 +50,8 @@ def _warn_of_incomplete(vis, output):
     if output.savemodel == "modelcolumn":
         return
     for name in incomplete_columns(vis):
-        log.warn(f"MODEL_DATA of '{name}' is incomplete, a run was killed while it wrote it: calibrate with it only after "
-                 "tsara(…, restart=True, niter=0, savemodel='modelcolumn') has written it anew")
+        log.warn(f"MODEL_DATA of '{name}' is incomplete, a run was killed while it wrote it: calibrate with it only "
+                 "after tsara with restart=True, niter=0, savemodel='modelcolumn' has written it anew")
 
 
 def _report(imagename, selection, nthreads):

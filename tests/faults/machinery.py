@@ -82,6 +82,14 @@ def dies_in(module, name, call=1, after=False):
 """
 
 
+def begun_with(script):
+    """Return the program of the child process of `casa_sara.casa.child`, with a script of Python before its job."""
+    from casa_sara.casa import child
+
+    first, main = child._START.rsplit("; ", 1)
+    return f"{first}\n{PREAMBLE}{script}\n{main}"
+
+
 def start_script(script, *arguments, **options):
     """Start a script of Python, after `PREAMBLE`, in a process of its own."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
