@@ -348,7 +348,8 @@ class _tsara:
 
     restart : bool, default False
         True starts from the existing imagename.model and replaces the products; the model must
-        have the shape and coordinates asked for. False starts afresh.
+        have the shape and coordinates asked for. False starts afresh. With niter=0 and
+        savemodel='modelcolumn' the products stay as they are, and only the column is written.
 
     overwrite : bool, default False
         True lets the task replace products of an earlier run with the same imagename. False
@@ -356,7 +357,9 @@ class _tsara:
 
     savemodel : {'none', 'modelcolumn'}, default 'none'
         'modelcolumn' writes the visibilities of the model into MODEL_DATA of each MeasurementSet,
-        for self-calibration. 'none' leaves the MeasurementSets untouched.
+        for self-calibration, when the images are complete. 'none' leaves the MeasurementSets
+        untouched. Together with restart=True and niter=0 it writes the visibilities of the existing
+        imagename.model and leaves the images as they are: also where a run was killed in this phase.
 
     parallel : {False}, default False
         Only False: the task runs in one process, with nthreads threads.
