@@ -80,6 +80,22 @@ def test_threads_of_one_process_take_turns(name, tmp_path):
         pass
 
 
+def test_a_run_that_ends_while_the_next_one_begins(name, monkeypatch):
+    """The file is opened, then its holder removes it and ends: the lock on it would keep nobody off."""
+    original, calls = lock._lock, []
+
+    def late(*args):
+        if not calls:
+            os.unlink(name + ".lock")
+        calls.append(args)
+        original(*args)
+
+    monkeypatch.setattr(lock, "_lock", late)
+    with one_run_of(name), pytest.raises(BlockingIOError), one_run_of(name):
+        pass
+    assert len(calls) == 3
+
+
 def test_an_error_inside_gives_the_lock_back(name, tmp_path):
     with pytest.raises(KeyboardInterrupt), one_run_of(name):
         raise KeyboardInterrupt

@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import tempfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,6 +109,15 @@ def test_a_disk_without_room_is_refused_before_and_after_the_solution(vis, tmp_p
         with pytest.raises(OSError, match=r"imagename = '.*': the images take 2.1 MB, '.*' has 1.0 MB left"):
             tsara(vis=vis, imagename=str(disk / "source"), niter=0, **GRID)
         assert [path.name for path in disk.iterdir()] == ["filler"]
+
+
+def test_temporary_files_without_room(vis, tmp_path, monkeypatch):
+    with small_disk(tmp_path / "disk", 8_000) as disk:
+        monkeypatch.setattr(tempfile, "tempdir", str(disk))
+        filler = fill(disk, 1_000_000)
+        with pytest.raises(OSError, match=f"the folder of temporary files, '{disk}', has 1.0 MB left, and an image takes 2.0 MB"):
+            tsara(vis=vis, imagename=str(tmp_path / "source"), niter=0, **GRID)
+        assert list(disk.iterdir()) == [filler] and list(tmp_path.iterdir()) == [disk]
 
 
 def test_a_failure_of_casa_is_told_in_its_words(tmp_path):
