@@ -174,7 +174,8 @@ def test_a_measurement_set_that_is_open_in_the_session(copied):
         save_model_column([str(copied)], lambda name: write(name), name=copied)
     finally:
         tb.close()
-    np.testing.assert_allclose(spectral_window(copied, "MODEL_DATA", 0), spectral_window(copied, "DATA", 0), atol=2e-6)
+    model, data = (spectral_window(copied, col, 0) for col in ("MODEL_DATA", "DATA"))
+    np.testing.assert_allclose(model, data, atol=2e-6)
 
 
 def test_wrong_read_back_is_an_error(copied, monkeypatch):

@@ -56,8 +56,8 @@ def _take(path, imagename):
         try:
             _lock(handle, imagename)
             if os.fstat(handle).st_size and not _said(handle):
-                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is no lock of tsara and in its "
-                                      "way; move it, or choose another name")
+                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is no lock of tsara and in "
+                                      "its way; move it, or choose another name")
             if _stands(handle, path):
                 return handle
         except BaseException:

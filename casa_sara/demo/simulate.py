@@ -212,7 +212,7 @@ class _Rows:
 
 
 def gain_errors(gain_rms: float, shape: tuple[int, int], seed: list[int]) -> np.ndarray:
-    """Return the gains, complex (scan, antenna), of a MeasurementSet: `seed` is the observation's and its own number."""
+    """Return the gains, complex (scan, antenna), of a MeasurementSet; `seed`: the observation's, its own number."""
     gain = np.random.default_rng([*seed, 1])
     return (1 + gain_rms * gain.standard_normal(shape)) * np.exp(1j * gain_rms * gain.standard_normal(shape))
 

@@ -3,7 +3,8 @@
     python docs/tutorials/selfcal.py [folder]
 
 Simulates a VLA observation of a small radio galaxy with known gain errors, one amplitude and one phase for each
-antenna and scan, and compares what the two models recover of them. Prints the table and draws the picture of selfcal.md.
+antenna and scan, and compares what the two models recover of them. Prints the table and draws the picture of
+selfcal.md.
 """
 
 import sys
@@ -62,13 +63,14 @@ def one_round(folder, simulation, image, grid):
     image(vis, str(folder / "after"), grid, "corrected")
     roots = [str(folder / when) for when in ("before", "after")]
     models = [read_image(root + ".model")[0] for root in roots]
-    return Round(models, [snr_at_scale(simulation.truth, model, BEAM_ARCSEC / CELL_ARCSEC) for model in models], [dynamic_range(root) for root in roots],
-                 gain_error(gains))
+    snr_db = [snr_at_scale(simulation.truth, model, BEAM_ARCSEC / CELL_ARCSEC) for model in models]
+    return Round(models, snr_db, [dynamic_range(root) for root in roots], gain_error(gains))
 
 
 def tsara_model(vis, imagename, grid, column):
     """Image with tsara; its model goes into MODEL_DATA."""
-    tsara(vis=vis, imagename=imagename, datacolumn=column, savemodel="modelcolumn", weighting="briggs", robust=-1.0, **grid)
+    tsara(vis=vis, imagename=imagename, datacolumn=column, savemodel="modelcolumn", weighting="briggs",
+          robust=-1.0, **grid)
 
 
 def tclean_model(vis, imagename, grid, column):
@@ -82,7 +84,7 @@ def dynamic_range(root):
 
 
 def gain_error(caltable):
-    """Return the rms of found over true gains − 1; the phase that all antennas of a scan share and one scale are free."""
+    """Return the rms of found over true gains − 1; one scale, and one phase in each scan, are free."""
     tb = table()
     tb.open(caltable)
     try:
@@ -100,7 +102,8 @@ def gain_error(caltable):
 
 def as_text(rounds):
     """Return the table of the results."""
-    lines = ["| model | gains, rms error | SNR of the model before, after | dynamic range before, after |", "|---|---|---|---|"]
+    lines = ["| model | gains, rms error | SNR of the model before, after | dynamic range before, after |",
+             "|---|---|---|---|"]
     for name, one in rounds.items():
         lines.append(f"| {name} | {one.gain_error:.2%} | {one.snr_db[0]:.1f}, {one.snr_db[1]:.1f} dB "
                      f"| {one.dynamic_range[0]:.0f}, {one.dynamic_range[1]:.0f} |")

@@ -35,8 +35,8 @@ def test_another_process_holds_the_name(name, tmp_path):
     try:
         assert other.stdout.readline() == "held\n"
         before = (tmp_path / "source.lock").read_text()
-        with pytest.raises(BlockingIOError, match=rf"imagename = '{name}': process {other.pid} on .*, since 20\S+ \S+, is writing"), \
-                one_run_of(name):
+        words = rf"imagename = '{name}': process {other.pid} on .*, since 20\S+ \S+, is writing"
+        with pytest.raises(BlockingIOError, match=words), one_run_of(name):
             pass
         with one_run_of(name + "2"), one_run_of(str(tmp_path / "sourc")):
             assert (tmp_path / "source.lock").read_text() == before

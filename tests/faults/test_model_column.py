@@ -107,7 +107,8 @@ def casa_goes_on(copy, folder):
     import casatasks
 
     edit(copy, "FLAG", lambda flag: flag)
-    casatasks.tclean(vis=str(copy), imagename=str(folder / "clean"), imsize=64, cell="1arcsec", datacolumn="data", niter=5)
+    casatasks.tclean(vis=str(copy), imagename=str(folder / "clean"), imsize=64, cell="1arcsec", niter=5,
+                     datacolumn="data")
     casatasks.gaincal(vis=str(copy), caltable=str(folder / "gains"), solint="inf", refant="0")
     assert np.isfinite(column(folder / "gains", "CPARAM")).all()
 
@@ -149,8 +150,8 @@ def test_a_disk_that_fills_while_the_column_is_added(vis, uninterrupted, tmp_pat
             in_child(*args, **kwargs)
 
         monkeypatch.setattr(modelcolumn, "in_child", filled)
-        with pytest.raises(OSError, match="savemodel = 'modelcolumn': MODEL_DATA could not be written, the disk is full: "
-                                          ".*; the MeasurementSets are as they were"):
+        with pytest.raises(OSError, match="savemodel = 'modelcolumn': MODEL_DATA could not be written, the disk is "
+                                          "full: .*; the MeasurementSets are as they were"):
             tsara(vis=str(copy), imagename=str(tmp_path / "source"), **FINISH)
         assert hashes(copy, "table.lock") == before
         assert_the_rest_is_as_it_was(copy, vis)
@@ -167,12 +168,13 @@ def test_a_disk_that_is_full_when_the_column_is_due(vis, uninterrupted, tmp_path
         copy = shutil.copytree(vis, disk / "c.ms")
         before = hashes(copy, "table.lock")
         filler = fill(disk, 200_000)
-        with pytest.raises(OSError, match="savemodel = 'modelcolumn' needs .* MB for MODEL_DATA, but the disk of") as raised:
+        words = "savemodel = 'modelcolumn' needs .* MB for MODEL_DATA, but the disk of"
+        with pytest.raises(OSError, match=words) as raised:
             tsara(vis=str(copy), imagename=str(tmp_path / "never"), savemodel="modelcolumn", **GRID)
         assert raised.value.errno == errno.ENOSPC and not (tmp_path / "never.model").exists()
         filler.unlink()
         monkeypatch.setattr("casa_sara.imaging.fit_beam", fit_beam_and(lambda: fill(disk, 200_000)))
-        with pytest.raises(OSError, match="savemodel = 'modelcolumn' needs .* MB for MODEL_DATA, but the disk of"):
+        with pytest.raises(OSError, match=words):
             tsara(vis=str(copy), imagename=str(tmp_path / "source"), savemodel="modelcolumn", **GRID)
         assert (tmp_path / "source.sara.json").exists() and hashes(copy, "table.lock") == before
         monkeypatch.undo()
@@ -197,7 +199,8 @@ def filled(*args):
     return original(*args)
 modelcolumn._write = filled
 """))
-        with pytest.raises(OSError, match=f"the disk is full: .*; MODEL_DATA of {copy} is incomplete; restart=True") as got:
+        words = f"the disk is full: .*; MODEL_DATA of {copy} is incomplete; restart=True"
+        with pytest.raises(OSError, match=words) as got:
             tsara(vis=str(copy), imagename=str(tmp_path / "source"), **FINISH)
         assert got.value.errno == errno.ENOSPC and (copy / INCOMPLETE).exists()
         assert_the_rest_is_as_it_was(copy, vis)
@@ -222,7 +225,8 @@ def test_read_only_measurement_set(copy, tmp_path):
     """It is imaged as any other; a model column is refused before the imaging begins."""
     before = hashes(copy)
     with read_only(copy):
-        with pytest.raises(PermissionError, match=f"savemodel = 'modelcolumn' writes into vis = '{copy}', but .* is write-protected"):
+        words = f"savemodel = 'modelcolumn' writes into vis = '{copy}', but .* is write-protected"
+        with pytest.raises(PermissionError, match=words):
             tsara(vis=str(copy), imagename=str(tmp_path / "source"), savemodel="modelcolumn", **GRID)
         assert not list(tmp_path.glob("source*"))
         tsara(vis=str(copy), imagename=str(tmp_path / "source"), **GRID)

@@ -64,7 +64,8 @@ def fills_the_disk(monkeypatch, disk, left):
         in_child(*args, **kwargs)
 
     monkeypatch.setattr(products, "in_child", filled)
-    return pytest.raises(OSError, match=rf"imagename = '{disk}/source': '{disk}' filled up while .* MB they had .* left")
+    words = rf"imagename = '{disk}/source': '{disk}' filled up while .* MB they had .* left"
+    return pytest.raises(OSError, match=words)
 
 
 @pytest.mark.parametrize("left", [0, 40_000, 300_000, 700_000])
@@ -115,14 +116,16 @@ def test_temporary_files_without_room(vis, tmp_path, monkeypatch):
     with small_disk(tmp_path / "disk", 8_000) as disk:
         monkeypatch.setattr(tempfile, "tempdir", str(disk))
         filler = fill(disk, 1_000_000)
-        with pytest.raises(OSError, match=f"the folder of temporary files, '{disk}', has 1.0 MB left, and an image takes 2.0 MB"):
+        words = f"the folder of temporary files, '{disk}', has 1.0 MB left, and an image takes 2.0 MB"
+        with pytest.raises(OSError, match=words):
             tsara(vis=vis, imagename=str(tmp_path / "source"), niter=0, **GRID)
         assert list(disk.iterdir()) == [filler] and list(tmp_path.iterdir()) == [disk]
 
 
 def test_a_failure_of_casa_is_told_in_its_words(tmp_path):
-    with pytest.raises(ChildError, match="has no attribute|KeyError|csys|string indices|NoneType"):
-        in_child("products", root=str(tmp_path / "x"), plane={}, images={}, sumwt=1.0, beam={}, restoringbeam=None, history=[])
+    with pytest.raises(ChildError, match="missing 5 required positional arguments: 'csys'"):
+        in_child("products", root=str(tmp_path / "x"), plane={}, images={}, sumwt=1.0, beam={}, restoringbeam=None,
+                 history=[])
     with pytest.raises(ChildError, match="KeyError: 'absent'"):
         in_child("absent")
 
@@ -178,10 +181,12 @@ import casa_sara.casa.products as products
 dies_in(products, "in_child", after={after})
 tsara(vis={vis!r}, imagename={str(tmp_path / 'source')!r}, niter=0, overwrite=True, **{GRID!r})
 """)
-    assert {name: digest for name, digest in hashes(tmp_path, "source.lock").items() if not name.startswith(".")} == before
+    left = hashes(tmp_path, "source.lock")
+    assert {name: digest for name, digest in left.items() if not name.startswith(".")} == before
     assert (tmp_path / ".source.new").exists() and (tmp_path / ".source.new" / "source.image").exists() == after
     tsara(vis=vis, imagename=str(tmp_path / "source"), niter=0, overwrite=True, **GRID)
-    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([".source.new.new", *("source" + suffix for suffix in ALL)])
+    expected = [".source.new.new", *("source" + suffix for suffix in ALL)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted(expected)
     assert not model(tmp_path / "source").any()
 
 
@@ -200,6 +205,7 @@ def test_read_only_output_folder(vis, tmp_path):
     folder = tmp_path / "closed"
     folder.mkdir()
     with read_only(folder):
-        with pytest.raises(PermissionError, match=f"imagename = '{folder}/source': the folder '{folder}' cannot be written to"):
+        words = f"imagename = '{folder}/source': the folder '{folder}' cannot be written to"
+        with pytest.raises(PermissionError, match=words):
             tsara(vis=vis, imagename=str(folder / "source"), niter=0, **GRID)
         assert not list(folder.iterdir())
