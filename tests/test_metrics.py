@@ -18,6 +18,7 @@ def test_snr_by_hand():
     assert metrics.snr([3.0, 4.0], [3.0, 4.5]) == pytest.approx(20.0)  # 5 against 0.5
     assert metrics.snr([[1.0, 0.0]], [[0.0, 0.0]]) == 0.0
     assert metrics.snr([1.0, 2.0], [1.0, 2.0]) == np.inf
+    assert np.isnan(metrics.snr([1.0, 2.0], [1.0, np.nan]))  # not a perfect model
 
 
 def test_log_snr_by_hand():
