@@ -90,7 +90,8 @@ def measures(products, sky, regions):
             }  # fmt: skip
         if sky is not None:
             entry["truth"] = {"snr": metrics.snr(sky, made.model), "log_snr": metrics.log_snr(sky, made.model),
-                              "ssim": 0.97, "snr_at_scale": {"0.4": 30.0, "1.0": 40.0}}
+                              "ssim": 0.97, "ssim_range_jy_per_pixel": float(sky.max()),
+                              "snr_at_scale": {"0.4": 30.0, "1.0": 40.0}}
         found[made.name] = entry
     pairs = {f"{a.name}|{b.name}": metrics.snr(a.model, b.model)
              for number, a in enumerate(products) for b in products[number + 1 :]}

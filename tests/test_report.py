@@ -64,7 +64,7 @@ def pixels(path):
 def test_report_has_every_section_and_picture(report):
     page = Page(report)
     assert page.ids == ["warnings", "measures", "sky", "residuals", "runs", "notes", "parameters", "versions"]
-    expected = ["Models", "Residual and restored images, natural weighting",
+    expected = ["Models", "Residual and restored images, natural weighting", "χ² of the blocks",
                 "Regions, flux of the models", "Regions, flux of the restored images", "Against the truth",
                 "Similarity", "All products, natural weighting", "All products, briggs weighting", "Models, enlarged",
                 "Differences", "From coarse to fine pixels", "Radial power spectra", "Histograms of the residuals",
@@ -264,7 +264,7 @@ def test_animation_has_a_frame_for_each_image(tmp_path):
 def test_table_as_text(full):
     text = as_text(full)
     titles = [table.title for table in tables(full)]
-    assert len(titles) == 7 and all(title in text for title in titles)
+    assert len(titles) == 8 and all(title in text for title in titles)
     assert "note: one sample was wild & left out" in text
     flux = full.measures["products"]["tsara"]["flux_jy"]
     assert re.search(rf"^ +flux .*\n +Jy .*\n  tsara +{flux:.4f} ", text, re.MULTILINE)
@@ -303,6 +303,16 @@ def test_names_are_printed_as_they_are():
     assert plain("_a $b$") == r" _a \$b\$" and plain("a_b") == "a_b"
 
 
+def test_chi_square_of_the_blocks_and_the_range_of_ssim(full):
+    made = {table.title: table for table in tables(full)}
+    blocks, against = made["χ² of the blocks"], made["Against the truth"]
+    assert blocks.heads == ("", "median", "least", "most", "blocks")
+    assert blocks.rows[0] == ("tsara", "1.100", "1.000", "1.400", "3")
+    number_of = against.heads.index("SSIM")
+    assert against.heads[number_of + 1] == "its range" and against.units[number_of + 1] == "mJy/pixel"
+    assert float(against.rows[0][number_of + 1]) == pytest.approx(1e3 * full.truth.max(), rel=1e-3)
+
+
 def test_what_was_not_measured_is_left_out(full):
     measured = {"products": {"tsara": {"flux_jy": 1.0}, "tclean briggs": {"flux_jy": 2.0, "mdr": float("inf")}},
                 "similarity": {"natural": {"tsara|tclean briggs": float("inf")}}}
@@ -316,16 +326,18 @@ def test_what_was_not_measured_is_left_out(full):
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium to render the page")
 @pytest.mark.parametrize("width", [1024, 1400])
 def test_page_fits_the_window(report, width, tmp_path):
-    """The page is no wider than the window: asked of the layout, and seen at the right edge of a screenshot."""
+    """The page is no wider than the window, nor a table than the page: asked of the layout, and seen in a screenshot."""
     probe = tmp_path / "probe.html"
-    script = "<script>document.title = document.documentElement.scrollWidth + ' ' + innerWidth</script></body>"
+    script = """<script>document.title = [document.documentElement.scrollWidth, innerWidth,
+        ...[...document.querySelectorAll(".wide")].map(box => box.scrollWidth - box.clientWidth)].join(" ")</script></body>"""
     probe.write_text(report.read_text(encoding="utf-8").replace("</body>", script), encoding="utf-8")
     picture = tmp_path / "page.png"
     browser = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
                f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},3000"]
     dom = subprocess.run([*browser, "--dump-dom", probe.as_uri()], capture_output=True, text=True, timeout=120)
-    title = re.search(r"<title>(\d+) (\d+)</title>", dom.stdout)
-    assert title and title[1] == title[2] == str(width)
+    page_width, window, *beyond = map(int, re.search(r"<title>([\d ]+)</title>", dom.stdout)[1].split())
+    assert page_width == window == width
+    assert len(beyond) == 10 and not any(beyond)  # eight tables of measures, parameters and versions
     subprocess.run([*browser, f"--screenshot={picture}", report.as_uri()], capture_output=True, check=True, timeout=120)
     page = pixels(picture)
     assert page.shape == (3000, width, 3)

@@ -248,7 +248,10 @@ def test_truth_is_brought_to_the_same_pixels(tmp_path):
     found = saracompare(models=[one, one], truth=truth)["products"]["one"]
     by_hand = 20 * np.log10(np.linalg.norm(sky()) / np.linalg.norm(model - sky()))
     assert found["truth"]["snr"] == pytest.approx(by_hand, abs=0.1)
-    assert set(found["truth"]) == {"snr", "log_snr", "ssim", "snr_at_scale"}
+    assert set(found["truth"]) == {"snr", "log_snr", "ssim", "ssim_range_jy_per_pixel", "snr_at_scale"}
+    peak = found["truth"]["ssim_range_jy_per_pixel"]
+    assert peak == pytest.approx(1.0, rel=1e-3)  # of the truth
+    assert found["truth"]["ssim"] == pytest.approx(metrics.ssim(sky(), model, peak), rel=1e-3)
 
 
 # Visibilities -----------------------------------------------------------------------------------

@@ -57,7 +57,7 @@ def tables(comparison) -> list[Table]:
     measured = comparison.measures.get("products", {})
     names = [product.name for product in comparison.products if product.name in measured]
     measured = {name: measured[name] for name in names}
-    made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS),
+    made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS), _blocks(measured),
             *(_regions(measured, *of) for of in REGION_TABLES), _truth(measured),
             _similarity(comparison.measures.get("similarity", {}))]
     return [table for table in made if table is not None]
@@ -132,7 +132,7 @@ def _models(measured):
 
 
 def _residuals(measured, weighting):
-    entries = {name: _flat(entry[weighting]) for name, entry in measured.items() if weighting in entry}
+    entries = {name: entry[weighting] for name, entry in measured.items() if weighting in entry}
     columns = [
         ("sigma", "σ", "Jy/beam"),
         ("max_abs", "largest |r|", "Jy/beam"),
@@ -141,25 +141,28 @@ def _residuals(measured, weighting):
         ("skewness", "skewness", ""),
         ("kurtosis", "kurtosis", ""),
         ("whiteness", "whiteness", ""),
-        ("chi_square", "χ² of the blocks", ""),
     ]
     caption = (
         "Residual images of all products made with one operator and the same weights. DR: peak of the restored image "
-        "over σ, the standard deviation of the residual image. χ² of the blocks: median, least and most."
+        "over σ, the standard deviation of the residual image."
     )
     return _build(f"Residual and restored images, {weighting} weighting", columns, entries, caption)
 
 
-def _flat(entry):
-    """Return the measures of one weighting with χ² of the blocks in words."""
-    chi = entry.get("chi_square")
-    if chi is None or not np.size(chi):
-        return {key: value for key, value in entry.items() if key != "chi_square"}
-    chi = np.atleast_1d(np.asarray(chi, float))
-    text = number(float(np.median(chi)), 3)
-    if chi.size > 1:
-        text += f" ({number(float(chi.min()), 3)}–{number(float(chi.max()), 3)})"
-    return {**entry, "chi_square": text}
+def _blocks(measured):
+    """χ² of the blocks: how many there are, and their median and extremes."""
+    entries = {}
+    for name, entry in measured.items():
+        chi = np.atleast_1d(np.asarray(entry.get("natural", {}).get("chi_square", []), float))
+        if chi.size:
+            entries[name] = {"blocks": str(chi.size), "median": float(np.median(chi)), "least": float(chi.min()),
+                             "most": float(chi.max())}
+    columns = [("median", "median", ""), ("least", "least", ""), ("most", "most", ""), ("blocks", "blocks", "")]
+    caption = (
+        "Of each block, the sum of w|r|² of its residual visibilities over twice their number: 1 where the model leaves "
+        "noise as the weights say, less where it has fitted noise."
+    )
+    return _build("χ² of the blocks", columns, entries, caption)
 
 
 def _regions(measured, key, title, caption):
@@ -194,11 +197,13 @@ def _truth(measured):
         name: {**entry, **{("scale", scale): value for scale, value in entry.get("snr_at_scale", {}).items()}}
         for name, entry in entries.items()
     }
-    columns = [("snr", "SNR", "dB"), ("log_snr", "log SNR", "dB"), ("ssim", "SSIM", "")]
+    columns = [("snr", "SNR", "dB"), ("log_snr", "log SNR", "dB"), ("ssim", "SSIM", ""),
+               ("ssim_range_jy_per_pixel", "its range", "Jy/pixel")]
     columns += [(("scale", scale), f'SNR at {float(scale):.3g}"', "dB") for scale in scales]
     caption = (
         "SNR: norm of the truth over that of the error. Log SNR: the same of the images on a logarithmic scale, where "
-        "faint emission counts. SNR at a scale: both smoothed to that width."
+        "faint emission counts. SSIM, the structural similarity, 1 for equal images, of values within its range: 0 to "
+        "the peak of the truth. SNR at a scale: both smoothed to that width."
     )
     return _build("Against the truth", columns, flat, caption)
 

@@ -158,8 +158,8 @@ class _saracompare:
       the model), regions (flux_jy, error_jy, model_flux_jy of each) and, for natural and briggs
       weights, sigma, peak, dr (peak of the restored image over the standard deviation of the
       residual), max_abs, skewness, kurtosis, whiteness and chi_square of each snapshot; with a
-      truth also snr, log_snr, ssim and snr_at_scale (in dB, by the beam in arcsec), and
-      fwhm_recovered_arcsec where the truth has a point source. 'similarity' holds for each
+      truth also snr, log_snr, ssim with its range, and snr_at_scale (in dB, by the beam in arcsec),
+      and fwhm_recovered_arcsec where the truth has a point source. 'similarity' holds for each
       weighting S in dB of each pair 'one|other' of models smoothed with the beam. What could not
       be measured is left out.
 
