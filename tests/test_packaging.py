@@ -41,7 +41,7 @@ ROOMS = {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },
     "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
-    "analysis": {"numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
+    "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
     "jsonfile": set(),
 }
 LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")

@@ -78,6 +78,41 @@ def test_report_has_every_section_and_picture(report):
         assert word in page.text
 
 
+def test_a_report_replaces_the_earlier_one_whole(tmp_path, monkeypatch):
+    """Pictures of the earlier report go, other files stay, and a report that fails changes nothing."""
+    few = comparison(names=("one",), with_truth=False)
+    write_report(comparison(), tmp_path, frames=FRAMES)
+    (tmp_path / "mine.png").write_text("mine")
+    (tmp_path / "differences.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(diagnostics, "histograms", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_report(few, tmp_path)
+    with pytest.raises(ZeroDivisionError):
+        write_report(few, tmp_path / "new")
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.undo()
+    write_report(few, tmp_path)
+    after = {path.name for path in tmp_path.iterdir()}
+    assert after == before.keys() - {"cells.png", "differences.png"} and after < before.keys()
+    assert (tmp_path / "mine.png").read_text() == (tmp_path / "differences.txt").read_text() == "mine"
+    assert "tclean natural" not in (tmp_path / "report.html").read_text()
+
+
+def test_a_file_that_is_not_the_reports_is_not_replaced(tmp_path):
+    few = comparison(names=("one",), with_truth=False)
+    (tmp_path / "zooms.png").write_text("mine")
+    with pytest.raises(FileExistsError, match="holds zooms.png, not of an earlier report"):
+        write_report(few, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["zooms.png"]
+    folder, outside = tmp_path / "folder", tmp_path / "outside.txt"
+    folder.mkdir()
+    outside.write_text("mine")
+    (folder / "report.files").write_text("../outside.txt\n..\nreport.files\n")
+    write_report(few, folder)
+    assert outside.read_text() == "mine" and (folder / "report.html").exists()
+
+
 def test_report_is_self_contained(report):
     page = Page(report)
     assert all(link.startswith(("data:image/png;base64,", "#")) for link in page.links)

@@ -477,6 +477,9 @@ def test_overwrite_replaces_the_report_and_leaves_other_files(tmp_path):
     found = saracompare(models=[one, one], names=["a", "b"], outdir="report", overwrite=True)
     assert jsonfile.load("report/measures.json") == found and list(found["products"]) == ["a", "b"]
     assert Path("report/mine.txt").read_text() == "mine"
+    Path("report/report.files").unlink()
+    with pytest.raises(FileExistsError, match="outdir = 'report' holds report.html, measures.json, not of an earlier"):
+        saracompare(models=[one, one], outdir="report", overwrite=True)
 
 
 # Task -------------------------------------------------------------------------------------------

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import casa_sara
-from casa_sara import jsonfile
 from casa_sara.analysis.comparison import Comparison
+from casa_sara.analysis.folder import MEASURES, PAGE, in_the_way
 from casa_sara.casa import log
 from casa_sara.compare import compare_images
 from casa_sara.options import Comparing, Selection
@@ -18,7 +18,6 @@ from casa_sara.tasks.saracompare import PARAMETERS
 
 __all__ = ["saracompare"]
 
-MEASURES = "measures.json"
 OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust")  # what has no effect without vis
 
 
@@ -32,8 +31,6 @@ def saracompare(**parameters: Any) -> dict[str, Any]:
                         parameters["robust"], available_cores())
     comparison = compare_images(request, selection)
     if folder:
-        folder.mkdir(exist_ok=True)
-        jsonfile.save(folder / MEASURES, comparison.measures)
         _report(comparison, folder)
     return comparison.measures
 
@@ -61,6 +58,9 @@ def _folder(outdir, overwrite):
     if folder.is_dir() and any(folder.iterdir()) and not overwrite:
         raise FileExistsError(f"outdir = '{outdir}' holds files: choose another folder, or overwrite = True to replace "
                               "an earlier report in it")
+    if taken := in_the_way(folder, (PAGE, MEASURES)):
+        raise FileExistsError(f"outdir = '{outdir}' holds {', '.join(taken)}, not of an earlier report: choose another "
+                              "folder, or move it away")
     if not parent.is_dir():
         raise FileNotFoundError(f"outdir = '{outdir}': the folder '{parent}' does not exist")
     if not os.access(folder if folder.is_dir() else parent, os.W_OK | os.X_OK):
@@ -74,7 +74,7 @@ def _words(value):
 
 
 def _report(comparison: Comparison, folder: Path) -> None:
-    """Write the report and its pictures."""
+    """Write the report, its pictures and the measures."""
     from casa_sara.analysis.report import write_report  # matplotlib takes its time
 
     write_report(comparison, folder)

@@ -148,8 +148,9 @@ class _saracompare:
         smoothed to the beam: one support for all.
 
     overwrite : bool, default False
-        True replaces files of an earlier report in outdir; others stay. False refuses to start
-        when outdir holds any.
+        True replaces the files of an earlier report in outdir, which report.files names, all
+        together when the new ones are complete; other files stay. False refuses to start when
+        outdir holds any.
 
     Returns
     -------
