@@ -14,7 +14,7 @@ from casa_sara.analysis.comparison import Comparison, Product
 from casa_sara.analysis.measuring import measure, source_support
 from casa_sara.casa import log
 from casa_sara.casa.imageplane import define_image_plane
-from casa_sara.casa.imagesets import check_same_data, data_names, read_image_set
+from casa_sara.casa.imagesets import check_same_data, data_names, read_frames, read_image_set
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.skyimage import SkyPlane, beam_numbers, read_sky_image
@@ -61,6 +61,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or B1950")
     if RADESYS[first.plane.frame] == "FK4":
         notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
+    frames = read_frames(request.frames, first.plane)
     observed = _Observed(selection, first.plane, request, notes) if selection else None
     # one grid
     plane = observed.plane if observed else first.plane
@@ -92,7 +93,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     for note in notes:
         log.warn(note)
     return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures, versions,
-                      tuple(notes))
+                      tuple(notes), frames)
 
 
 def _read(request, with_residual, fewest):

@@ -113,4 +113,5 @@ class Comparing:
     support: str = ""
     threshold: float = 1e-3
     robust: float = -1.0
+    frames: tuple[str, ...] = ()
     nthreads: int = 1

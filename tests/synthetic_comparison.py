@@ -98,7 +98,7 @@ def measures(products, sky, regions):
     return {"products": found, "similarity": {weighting: dict(pairs) for weighting in WEIGHTINGS}}
 
 
-def comparison(names=("tsara", "tclean briggs", "tclean natural"), with_truth=True, with_regions=True):
+def comparison(names=("tsara", "tclean briggs", "tclean natural"), with_truth=True, with_regions=True, frames=()):
     """Return a comparison with everything in it."""
     parameters = {"vis": "['A.ms', 'D.ms']", "imsize": "[96, 64]", "cell": "0.1arcsec"}
     products = tuple(
@@ -114,4 +114,4 @@ def comparison(names=("tsara", "tclean briggs", "tclean natural"), with_truth=Tr
     sky = truth() if with_truth else None
     return Comparison(products, (CELL, CELL), (299.868, 40.734), dict(BEAMS), sky, truth() > 0, masks,
                       measures(products, sky, masks), {"casa_sara": "1.2.3", "numpy": "2.0"},
-                      ("one sample was wild & left out",))
+                      ("one sample was wild & left out",), frames)

@@ -20,7 +20,7 @@ from casa_sara.analysis.tables import as_text, number, tables
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
 EVIL = '<script>alert("1")</script>$x_$ & co'
-FRAMES = [("coarse", np.ones((8, 6)), 0.4), ("fine", np.eye(16, 12) + 1, 0.2)]
+FRAMES = (("coarse", np.ones((24, 16)), 0.4), ("fine", np.eye(48, 32) + 1, 0.2))
 
 
 class Page(html.parser.HTMLParser):
@@ -48,13 +48,12 @@ class Page(html.parser.HTMLParser):
 
 @pytest.fixture(scope="module")
 def full():
-    return comparison()
+    return comparison(frames=FRAMES)
 
 
 @pytest.fixture(scope="module")
 def report(full, tmp_path_factory):
-    return write_report(full, tmp_path_factory.mktemp("report"), title="A test", frames=FRAMES,
-                        zoom=(0.0, 0.0, 2.0))
+    return write_report(full, tmp_path_factory.mktemp("report"), title="A test")
 
 
 def pixels(path):
@@ -63,16 +62,17 @@ def pixels(path):
 
 def test_report_has_every_section_and_picture(report):
     page = Page(report)
-    assert page.ids == ["warnings", "measures", "sky", "residuals", "runs", "notes", "parameters", "versions"]
+    assert page.ids == ["warnings", "measures", "sky", "frames", "residuals", "runs", "notes", "parameters", "versions"]
     expected = ["Models", "Residual and restored images, natural weighting", "χ² of the blocks",
                 "Regions, flux of the models", "Regions, flux of the restored images", "Against the truth",
                 "Similarity", "All products, natural weighting", "All products, briggs weighting", "Models, enlarged",
-                "Differences", "From coarse to fine pixels", "Radial power spectra", "Histograms of the residuals",
+                "Differences", "Pixel by pixel: the field", "Pixel by pixel: core",
+                "Pixel by pixel: lobe", "Radial power spectra", "Histograms of the residuals",
                 "Convergence of tsara", "Calibration of tsara, block by block"]  # fmt: skip
     assert set(expected) <= set(page.titles)
     drawn = {path.name for path in report.parent.glob("*.png")}
-    assert drawn == {"sky_natural.png", "sky_briggs.png", "zooms.png", "differences.png", "cells.png", "spectra.png",
-                     "histograms.png", "convergence_1.png", "blocks_1.png"}  # fmt: skip
+    assert drawn == {"sky_natural.png", "sky_briggs.png", "zooms.png", "differences.png", "cells.png", "cells_1.png",
+                     "cells_2.png", "spectra.png", "histograms.png", "convergence_1.png", "blocks_1.png"}  # fmt: skip
     assert page.tags.count("img") == len(drawn)
     for word in ("imsize", "1.2.3", "one sample was wild & left out", "0.1160 ± 0.0013", "weighting"):
         assert word in page.text
@@ -81,7 +81,7 @@ def test_report_has_every_section_and_picture(report):
 def test_a_report_replaces_the_earlier_one_whole(tmp_path, monkeypatch):
     """Pictures of the earlier report go, other files stay, and a report that fails changes nothing."""
     few = comparison(names=("one",), with_truth=False)
-    write_report(comparison(), tmp_path, frames=FRAMES)
+    write_report(comparison(frames=FRAMES), tmp_path)
     (tmp_path / "mine.png").write_text("mine")
     (tmp_path / "differences.txt").write_text("mine")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
@@ -94,7 +94,7 @@ def test_a_report_replaces_the_earlier_one_whole(tmp_path, monkeypatch):
     monkeypatch.undo()
     write_report(few, tmp_path)
     after = {path.name for path in tmp_path.iterdir()}
-    assert after == before.keys() - {"cells.png", "differences.png"} and after < before.keys()
+    assert after == before.keys() - {"cells.png", "cells_1.png", "cells_2.png", "differences.png"} and after < before.keys()
     assert (tmp_path / "mine.png").read_text() == (tmp_path / "differences.txt").read_text() == "mine"
     assert "tclean natural" not in (tmp_path / "report.html").read_text()
 
@@ -253,6 +253,15 @@ def test_zooms_are_around_regions_or_peaks(full):
         assert any(z.box[0] <= x < z.box[1] and z.box[2] <= y < z.box[3] for z in peaks)
 
 
+def test_a_zoom_is_where_its_region_is(full):
+    """The box around the core is centred, in arcsec to the east and north, on the middle of its mask."""
+    core = zooms.find_zooms(full)[0]
+    east, north, side = core.on_sky(full)
+    x, y = np.argwhere(full.regions["core"]).mean(axis=0)
+    assert (east, north) == pytest.approx(((SHAPE[0] // 2 - x) * CELL, (y - SHAPE[1] // 2) * CELL), abs=CELL)
+    assert side == pytest.approx(1.3 * 15 * CELL, abs=CELL)
+
+
 def test_spectrum_of_white_noise_and_of_a_point():
     noise = np.random.default_rng(1).standard_normal((128, 96)) * 3
     for window in (False, True):
@@ -292,6 +301,8 @@ def test_animation_has_a_frame_for_each_image(tmp_path):
         assert np.any(np.asarray(image.convert("RGB"), float) != first)
     with pytest.raises(ValueError, match="zoom=.* holds no emission"):
         animation.animate(path, FRAMES, zoom=(50.0, 0.0, 1.0))
+    one = [*FRAMES, ("dark", np.zeros((8, 8)), 0.4)]
+    assert animation.has_emission(FRAMES, (0.0, 0.0, 1.0)) and not animation.has_emission(one, (0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="frames is empty"):
         animation.animate(path, [])
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from astropy import units
 from astropy.convolution import convolve_fft
+from PIL import Image
 from radio_beam import Beam
 from simulated_ms import simulate
 from test_shell import SCRIPT
@@ -254,6 +255,23 @@ def test_truth_is_brought_to_the_same_pixels(tmp_path):
     assert found["truth"]["ssim"] == pytest.approx(metrics.ssim(sky(), model, peak), rel=1e-3)
 
 
+def test_frames_are_animated_in_the_report(tmp_path):
+    """The field, and the region that holds emission; each with a frame for each image, in their order."""
+    one, *_ = product(tmp_path / "one")
+    fine = write(tmp_path / "fine.model", sky((256, 256), scale=2), cell=0.25)
+    regions = ["patch = 19h59m28.5s +40d44m02s 3.3arcsec", "empty = 19h59m28.5s +40d44m20s 2arcsec"]
+    saracompare(models=[one, one], outdir="report", frames=[one, fine], regions=regions)
+    drawn = sorted(path.name for path in Path("report").glob("cells*.png"))
+    assert drawn == ["cells.png", "cells_1.png"]
+    page = Path("report/report.html").read_text()
+    assert page.count("Pixel by pixel: ") == 2 * len(drawn) and 'id="frames"' in page
+    with Image.open("report/cells.png") as image:
+        assert image.n_frames == 2
+    comparison = compare_images(Comparing((one, one), frames=(fine, one)))
+    assert [(name, pixels.shape, round(cell, 9)) for name, pixels, cell in comparison.frames] \
+        == [("fine", (256, 256), 0.25), ("one", (128, 128), 0.5)]
+
+
 # Visibilities -----------------------------------------------------------------------------------
 
 
@@ -396,6 +414,10 @@ def test_models_beside_each_other_do_not_overlap(tmp_path):
     (dict(support="far.model"), ValueError, "support = 'far.model' holds 0 of 16384 pixels"),
     (dict(support="all.mask"), ValueError, "support = 'all.mask' holds 16384 of 16384 pixels"),
     (dict(threshold=2.0), ValueError, "threshold = 2.0"),
+    (dict(frames=["one", "two"]), ValueError, "frames = .*has no effect without outdir"),
+    (dict(frames="one", outdir="new"), ValueError, r"frames = \['one'\]: should be two or more images"),
+    (dict(frames=["one", "absent"], outdir="new"), FileNotFoundError, "frames = 'absent': neither it nor"),
+    (dict(frames=["one", "far.model"], outdir="new"), ValueError, "frames = 'far.model' has another centre"),
     (dict(robust=0.5), ValueError, "robust = 0.5 has no effect without vis"),
     (dict(scan="1"), ValueError, "scan = '1' has no effect without vis"),
     (dict(datacolumn="data"), ValueError, "datacolumn = 'data' has no effect without vis"),

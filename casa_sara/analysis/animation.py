@@ -12,7 +12,7 @@ from PIL import Image
 
 from casa_sara.analysis.sheets import BRIGHTNESS_MAP, DPI, plain, prefix
 
-__all__ = ["animate"]
+__all__ = ["animate", "has_emission"]
 
 
 def animate(path, frames: Sequence[tuple[str, np.ndarray, float]], zoom=None, decades=3.0, seconds=1.2) -> None:
@@ -35,13 +35,20 @@ def animate(path, frames: Sequence[tuple[str, np.ndarray, float]], zoom=None, de
     if not frames:
         raise ValueError("frames is empty: there is nothing to animate")
     zoom = zoom or (0.0, 0.0, min(min(image.shape) * cell for _, image, cell in frames))
-    peak = np.median([_peak(image / cell**2, cell, zoom) for _, image, cell in frames])
+    if not has_emission(frames, zoom):
+        raise ValueError(f"zoom={zoom} holds no emission of one of the frames")
+    peak = np.median([_peak(image, cell, zoom) / cell**2 for _, image, cell in frames])
     factor, sign = prefix(peak)
     norm = LogNorm(peak * factor / 10**decades, peak * factor)
     drawn = [_frame(title, image * factor / cell**2, cell, zoom, (norm, f"{sign}Jy arcsec$^{{-2}}$"))
              for title, image, cell in frames]
     waits = [int(1e3 * seconds)] * (len(drawn) - 1) + [int(2e3 * seconds)]
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=waits, loop=0)
+
+
+def has_emission(frames, zoom) -> bool:
+    """Tell whether every frame has emission in the part of the sky that `animate` would show of it."""
+    return all(_peak(image, cell, zoom) > 0 for _, image, cell in frames)
 
 
 def _edges(shape, cell):
@@ -51,13 +58,11 @@ def _edges(shape, cell):
 
 
 def _peak(image, cell, zoom) -> float:
-    """Return the peak within the zoom."""
+    """Return the peak within the zoom, 0 where the image does not reach."""
     nx, ny = image.shape
     east, north = (nx // 2 - np.arange(nx)) * cell, (np.arange(ny) - ny // 2) * cell
     inside = image[np.abs(east - zoom[0]) <= zoom[2] / 2][:, np.abs(north - zoom[1]) <= zoom[2] / 2]
-    if inside.size == 0 or not np.nanmax(inside) > 0:
-        raise ValueError(f"zoom={zoom} holds no emission of an image of {nx} × {ny} pixels of {cell:g} arcsec")
-    return float(np.nanmax(inside))
+    return float(np.nanmax(inside)) if inside.size else 0.0
 
 
 def _frame(title, image, cell, zoom, scale) -> Image.Image:

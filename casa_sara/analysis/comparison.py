@@ -69,6 +69,9 @@ class Comparison:
         Package → version.
     notes : tuple of str
         Warnings for the reader.
+    frames : tuple of (str, ndarray, float)
+        Title, model in Jy/pixel and pixel size in arcsec of reconstructions with different pixels, to be animated;
+        pixel (nx//2, ny//2) of each is at `centre_deg`.
     """
 
     products: tuple[Product, ...]
@@ -81,3 +84,4 @@ class Comparison:
     measures: dict[str, Any]
     versions: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    frames: tuple[tuple[str, np.ndarray, float], ...] = ()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,9 +44,7 @@ class Picture:
             return tuple(round(100 * pixels / DPI) for pixels in image.size)
 
 
-def write_report(comparison: Comparison, folder: Path, title: str = "SARA imaging report",
-                 frames: Sequence[tuple[str, np.ndarray, float]] = (),
-                 zoom: tuple[float, float, float] | None = None) -> Path:
+def write_report(comparison: Comparison, folder: Path, title: str = "SARA imaging report") -> Path:
     """Write the pictures of a comparison, report.html, which holds them all, and measures.json.
 
     Sections for which there is nothing are left out. The files of an earlier report are replaced, all together, when
@@ -60,10 +57,6 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     folder : Path
         Made if it is not there.
     title : str
-    frames : sequence of (str, ndarray, float), optional
-        Title, model in Jy/pixel and pixel size in arcsec of reconstructions with different pixels, to be animated.
-    zoom : (float, float, float), optional
-        The part of the frames that is shown: centre in arcsec to the east and to the north, and side in arcsec.
 
     Returns
     -------
@@ -78,12 +71,8 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     folder = Path(folder)
     with replaced(folder) as new:
         jsonfile.save(new / MEASURES, comparison.measures)
-        pictures = [*_sky(comparison, new)]
-        if frames:
-            animation.animate(new / "cells.png", frames, zoom)
-            pictures.append(Picture(new / "cells.png", "sky", "From coarse to fine pixels", "One part of the sky, "
-                                    "imaged with different pixel sizes, on one logarithmic scale."))
-        pictures += [*_residuals(comparison, new), *_runs(comparison, new)]
+        pictures = [*_sky(comparison, new), *_frames(comparison, new), *_residuals(comparison, new),
+                    *_runs(comparison, new)]
         (new / PAGE).write_text(_page(comparison, title, pictures), encoding="utf-8")
     return folder / PAGE
 
@@ -128,6 +117,23 @@ def _sky(comparison, folder) -> list[Picture]:
         made.append(Picture(path, "sky", "Differences", f"Models minus that of {what}, as they are and smoothed with "
                             "each CLEAN beam. Red: more than there; blue: less. The scales are linear and end at the "
                             "99.8th percentile."))
+    return made
+
+
+def _frames(comparison, folder) -> list[Picture]:
+    """Animate the images on different pixels: the field, and the regions in which all of them have emission."""
+    if not comparison.frames:
+        return []
+    parts = [("the field", None)]
+    if comparison.regions:
+        parts += [(zoom.name, zoom.on_sky(comparison)) for zoom in find_zooms(comparison)]
+    made = []
+    for number, (name, zoom) in enumerate(parts):
+        path = folder / (f"cells_{number}.png" if number else "cells.png")
+        if zoom is None or animation.has_emission(comparison.frames, zoom):
+            animation.animate(path, comparison.frames, zoom)
+            made.append(Picture(path, "frames", f"Pixel by pixel: {name}", "One part of the sky, imaged with different "
+                                "pixels, on one logarithmic scale. Grey: beyond an image."))
     return made
 
 

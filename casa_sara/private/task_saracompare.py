@@ -26,9 +26,11 @@ def saracompare(**parameters: Any) -> dict[str, Any]:
     log.info(f"casa_sara {casa_sara.__version__}")
     selection = _selection(parameters)
     folder = _folder(parameters["outdir"], parameters["overwrite"])
-    models, names, regions = (_words(parameters[name]) for name in ("models", "names", "regions"))
+    models, names, regions, frames = (_words(parameters[name]) for name in ("models", "names", "regions", "frames"))
+    if frames and not folder:
+        raise ValueError(f"frames = {list(frames)} has no effect without outdir: give outdir, the folder of the report")
     request = Comparing(models, names, parameters["truth"], regions, parameters["support"], parameters["threshold"],
-                        parameters["robust"], available_cores())
+                        parameters["robust"], frames, available_cores())
     comparison = compare_images(request, selection)
     if folder:
         _report(comparison, folder)

@@ -23,6 +23,7 @@ PARAMETERS = (
     Parameter('regions', ('string', 'stringVec'), [], 'Regions to measure the flux in'),
     Parameter('support', ('string',), '', "Where the source is: a mask image or a region; '': by threshold"),
     Parameter('threshold', ('double',), 0.001, 'The support is what exceeds this fraction of the peak', minimum=0.0, maximum=1.0),
+    Parameter('frames', ('string', 'stringVec'), [], 'Images to show one after the other, as an animation in the report'),
     Parameter('overwrite', ('bool',), False, 'Write into a folder that holds files'),
 )
 
@@ -147,6 +148,12 @@ class _saracompare:
         Used where support is ''. The truth is thresholded or, without it, the median of all models,
         smoothed to the beam: one support for all.
 
+    frames : str or list of str, default []
+        Two or more images of the field with different pixel sizes, in the order to show them, named
+        as in models and with their centre. The animation shows the field and every region of
+        regions, all frames on one scale of brightness.
+        Example: frames=['cell0.2/sara', 'cell0.1/sara', 'cell0.05/sara']
+
     overwrite : bool, default False
         True replaces the files of an earlier report in outdir, which report.files names, all
         together when the new ones are complete; other files stay. False refuses to start when
@@ -186,7 +193,7 @@ class _saracompare:
     def __call__(
         self, models='', names=[], outdir='', vis=[], selectdata=True, field='', spw='', timerange='', uvrange='',
         antenna='', scan='', observation='', intent='', datacolumn='corrected', robust=-1.0, truth='', regions=[],
-        support='', threshold=0.001, overwrite=False,
+        support='', threshold=0.001, frames=[], overwrite=False,
     ):
         """Run the task."""
         values = dict(locals())
