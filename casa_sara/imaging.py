@@ -22,7 +22,7 @@ from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
 from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
-__all__ = ["Result", "make_image"]
+__all__ = ["Result", "make_image", "solve_image"]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
@@ -70,8 +70,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
-        density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
-        reconstruction = _solve(data, offsets, density, grid, options, noise, start)
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start)
         model = reconstruction.model
         data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
@@ -105,8 +104,28 @@ def _limits(data, grid):
     return notes
 
 
-def _solve(data, offsets, density, grid, options, noise, start):
-    """Reconstruct, with progress in the log and Ctrl-C as the wish to stop."""
+def solve_image(data, offsets, noise, selection, grid, options, start=None):
+    """Reconstruct block-sorted visibilities, with progress in the log and Ctrl-C as the wish to stop.
+
+    Parameters
+    ----------
+    data : Visibilities
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    noise : float (d,)
+        Measured in the data, in units of what the weights say; NaN where unknown.
+    selection : Selection
+        That gave the data, for their sampling density.
+    grid : ImageGrid
+    options : SolverOptions
+    start : float32 (nx, ny), optional
+        First model, Jy/pixel.
+
+    Returns
+    -------
+    Reconstruction
+    """
+    density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
     progress = log.Progress()
     expected = schedule_of(options).expected_iterations
 

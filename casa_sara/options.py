@@ -114,4 +114,6 @@ class Comparing:
     threshold: float = 1e-3
     robust: float = -1.0
     frames: tuple[str, ...] = ()
+    inject: tuple[str, ...] = ()
+    injectflux: float = 0.0
     nthreads: int = 1

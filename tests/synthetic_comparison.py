@@ -93,6 +93,10 @@ def measures(products, sky, regions):
                               "ssim": 0.97, "ssim_range_jy_per_pixel": float(sky.max()),
                               "snr_at_scale": {"0.4": 30.0, "1.0": 40.0}}
         found[made.name] = entry
+    found[products[0].name]["injected"] = {"19h59m28.3s +40d44m12s": {
+        "injected_jy": 0.02, "flux_jy": 0.019, "offset_arcsec": 0.02, "fwhm_arcsec": 0.25,
+        "fwhm_in_beams": {name: 0.25 / np.sqrt(beam[0] * beam[1]) for name, beam in BEAMS.items()},
+    }}  # fmt: skip
     pairs = {f"{a.name}|{b.name}": metrics.snr(a.model, b.model)
              for number, a in enumerate(products) for b in products[number + 1 :]}
     return {"products": found, "similarity": {weighting: dict(pairs) for weighting in WEIGHTINGS}}

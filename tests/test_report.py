@@ -13,10 +13,11 @@ from PIL import Image
 from synthetic_comparison import BEAMS, CELL, SHAPE, comparison, measures, record
 
 from casa_sara.analysis import animation, convergence, diagnostics, pages, zooms
+from casa_sara.analysis.columns import number
 from casa_sara.analysis.comparison import Product
 from casa_sara.analysis.report import write_report
 from casa_sara.analysis.sheets import celestial, draw_beam, plain
-from casa_sara.analysis.tables import as_text, number, tables
+from casa_sara.analysis.tables import as_text, tables
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
 EVIL = '<script>alert("1")</script>$x_$ & co'
@@ -65,7 +66,7 @@ def test_report_has_every_section_and_picture(report):
     assert page.ids == ["warnings", "measures", "sky", "frames", "residuals", "runs", "notes", "parameters", "versions"]
     expected = ["Models", "Residual and restored images, natural weighting", "χ² of the blocks",
                 "Regions, flux of the models", "Regions, flux of the restored images", "Against the truth",
-                "Similarity", "All products, natural weighting", "All products, briggs weighting", "Models, enlarged",
+                "Injected point sources: resolution reached", "Similarity", "All products, natural weighting", "All products, briggs weighting", "Models, enlarged",
                 "Differences", "Pixel by pixel: the field", "Pixel by pixel: core",
                 "Pixel by pixel: lobe", "Radial power spectra", "Histograms of the residuals",
                 "Convergence of tsara", "Calibration of tsara, block by block"]  # fmt: skip
@@ -310,7 +311,7 @@ def test_animation_has_a_frame_for_each_image(tmp_path):
 def test_table_as_text(full):
     text = as_text(full)
     titles = [table.title for table in tables(full)]
-    assert len(titles) == 8 and all(title in text for title in titles)
+    assert len(titles) == 9 and all(title in text for title in titles)
     assert "note: one sample was wild & left out" in text
     flux = full.measures["products"]["tsara"]["flux_jy"]
     assert re.search(rf"^ +flux .*\n +Jy .*\n  tsara +{flux:.4f} ", text, re.MULTILINE)
@@ -359,6 +360,19 @@ def test_chi_square_of_the_blocks_and_the_range_of_ssim(full):
     assert float(against.rows[0][number_of + 1]) == pytest.approx(1e3 * full.truth.max(), rel=1e-3)
 
 
+def test_injected_sources_beside_the_beams(full):
+    """Widths in arcsec and in beams; a restored image is as wide as its own beam."""
+    made = {table.title: table for table in tables(full)}["Injected point sources: resolution reached"]
+    assert made.heads == ("", "injected", "recovered", "", "offset", "width", "width", "width")
+    assert made.units == ("", "mJy", "mJy", "%", "arcsec", "arcsec", "natural beams", "briggs beams")
+    assert made.rows == (
+        ("tsara, 19h59m28.3s +40d44m12s", "20.00", "19.00", "95.00", "0.02000", "0.2500", "0.315", "0.559"),
+        ("restored images, natural weighting", "–", "–", "–", "–", "0.7937", "1.000", "1.775"),
+        ("restored images, briggs weighting", "–", "–", "–", "–", "0.4472", "0.563", "1.000"),
+    )
+    assert "in a circle of 0.447″" in made.caption and "other imagers were not run again" in made.caption
+
+
 def test_what_was_not_measured_is_left_out(full):
     measured = {"products": {"tsara": {"flux_jy": 1.0}, "tclean briggs": {"flux_jy": 2.0, "mdr": float("inf")}},
                 "similarity": {"natural": {"tsara|tclean briggs": float("inf")}}}
@@ -383,7 +397,7 @@ def test_page_fits_the_window(report, width, tmp_path):
     dom = subprocess.run([*browser, "--dump-dom", probe.as_uri()], capture_output=True, text=True, timeout=120)
     page_width, window, *beyond = map(int, re.search(r"<title>([\d ]+)</title>", dom.stdout)[1].split())
     assert page_width == window == width
-    assert len(beyond) == 10 and not any(beyond)  # eight tables of measures, parameters and versions
+    assert len(beyond) == 11 and not any(beyond)  # nine tables of measures, parameters and versions
     subprocess.run([*browser, f"--screenshot={picture}", report.as_uri()], capture_output=True, check=True, timeout=120)
     page = pixels(picture)
     assert page.shape == (3000, width, 3)

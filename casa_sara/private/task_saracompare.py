@@ -18,7 +18,8 @@ from casa_sara.tasks.saracompare import PARAMETERS
 
 __all__ = ["saracompare"]
 
-OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust")  # what has no effect without vis
+LISTS = ("models", "names", "regions", "frames", "inject")
+OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust", "inject", "injectflux")  # what has no effect without vis
 
 
 def saracompare(**parameters: Any) -> dict[str, Any]:
@@ -26,11 +27,14 @@ def saracompare(**parameters: Any) -> dict[str, Any]:
     log.info(f"casa_sara {casa_sara.__version__}")
     selection = _selection(parameters)
     folder = _folder(parameters["outdir"], parameters["overwrite"])
-    models, names, regions, frames = (_words(parameters[name]) for name in ("models", "names", "regions", "frames"))
+    models, names, regions, frames, inject = (_words(parameters[name]) for name in LISTS)
     if frames and not folder:
         raise ValueError(f"frames = {list(frames)} has no effect without outdir: give outdir, the folder of the report")
+    if parameters["injectflux"] and not inject:
+        raise ValueError(f"injectflux = {parameters['injectflux']!r} has no effect without inject: give inject, the places "
+                         "of the sources")
     request = Comparing(models, names, parameters["truth"], regions, parameters["support"], parameters["threshold"],
-                        parameters["robust"], frames, available_cores())
+                        parameters["robust"], frames, inject, parameters["injectflux"], available_cores())
     comparison = compare_images(request, selection)
     if folder:
         _report(comparison, folder)
