@@ -356,3 +356,6 @@ def test_a_report_of_the_run(vis, tmp_path):
     assert all(words in page for words in ("natural weighting", "briggs weighting", "Convergence", "c.ms"))
     with pytest.raises(FileExistsError, match="run.report"):
         tsara(vis=vis, imagename=str(name), report=True, niter=40, **GRID)
+    (tmp_path / "run.report" / "mine.txt").write_text("mine")
+    tsara(vis=vis, imagename=str(name), niter=20, overwrite=True, **GRID)
+    assert [path.name for path in (tmp_path / "run.report").iterdir()] == ["mine.txt"]  # the report was of older images

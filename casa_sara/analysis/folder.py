@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-__all__ = ["MEASURES", "PAGE", "in_the_way", "replaced"]
+__all__ = ["MEASURES", "PAGE", "in_the_way", "remove", "replaced"]
 
 PAGE, MEASURES = "report.html", "measures.json"
 LIST = "report.files"  # names of the files that are the report's
@@ -58,6 +58,14 @@ def in_the_way(folder: Path, names: Iterable[str]) -> list[str]:
     """Return those of the names that stand in the folder and are not of an earlier report."""
     own = _own(folder)
     return [name for name in names if os.path.lexists(folder / name) and name not in own]
+
+
+def remove(folder: Path) -> None:
+    """Remove the files of a report, and the folder where it holds no others; nothing where there is none."""
+    for name in _own(folder):
+        (folder / name).unlink()
+    if folder.is_dir() and not os.listdir(folder):
+        folder.rmdir()
 
 
 def _own(folder) -> list[str]:

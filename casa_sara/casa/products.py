@@ -62,7 +62,8 @@ def new_products(imagename):
     """Yield the name under which to write the products; they take their place when all are complete.
 
     They are written in a temporary folder beside `imagename`. At the end those of an older
-    run are replaced, all together; when something fails, everything stays as it was.
+    run are replaced, all together; when something fails, everything stays as it was. The folder
+    of the report, where others may have put files, is left to who writes reports.
     """
     folder, base = os.path.split(imagename)
     scratch = tempfile.mkdtemp(prefix=f".{base}.", dir=folder or ".")
@@ -71,6 +72,8 @@ def new_products(imagename):
         written = os.listdir(scratch)
         replaced = tempfile.mkdtemp(dir=scratch)
         for path in existing_products(imagename):
+            if path.endswith(REPORT):
+                continue
             os.rename(path, os.path.join(replaced, os.path.basename(path)))
         for name in written:
             os.rename(os.path.join(scratch, name), os.path.join(folder, name))

@@ -8,6 +8,7 @@ from typing import Any
 
 import casa_sara
 from casa_sara import jsonfile
+from casa_sara.analysis import folder
 from casa_sara.casa import log
 from casa_sara.casa.modelcolumn import check_model_column_writable
 from casa_sara.casa.products import RECORD, REPORT, check_imagename, existing_products, history_lines
@@ -38,6 +39,8 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     jsonfile.save(output.imagename + RECORD, summary(result, options, full=True)["sara"])
     if parameters["report"]:
         _report(output.imagename, selection, options.nthreads)
+    else:
+        folder.remove(Path(output.imagename + REPORT))  # of older images
     return summary(result, options, parameters["fullsummary"])
 
 
