@@ -51,7 +51,8 @@ ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
 ROOMS["injection"] = {"casa_sara.casa", "casa_sara.imaging", "numpy", *NUMERICS}
 ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "numpy", *NUMERICS}
 ROOMS["demo"] = {
-    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS,
+    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "casa_sara.resources", "numpy", "finufft",
+    "matplotlib", *NUMERICS,
     *CASA,
 }
 

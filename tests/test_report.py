@@ -302,6 +302,10 @@ def test_animation_has_a_frame_for_each_image(tmp_path):
         assert np.any(np.asarray(image.convert("RGB"), float) != first)
     with pytest.raises(ValueError, match="zoom=.* holds no emission"):
         animation.animate(path, FRAMES, zoom=(50.0, 0.0, 1.0))
+    square = first.shape
+    animation.animate(path, FRAMES)  # the field of 48 x 32 pixels
+    with Image.open(path) as image:
+        assert image.width > 1.1 * square[1] and image.height < 0.9 * square[0]
     one = [*FRAMES, ("dark", np.zeros((8, 8)), 0.4)]
     assert animation.has_emission(FRAMES, (0.0, 0.0, 1.0)) and not animation.has_emission(one, (0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="frames is empty"):
@@ -363,7 +367,7 @@ def test_chi_square_of_the_blocks_and_the_range_of_ssim(full):
 def test_injected_sources_beside_the_beams(full):
     """Widths in arcsec and in beams; a restored image is as wide as its own beam."""
     made = {table.title: table for table in tables(full)}["Injected point sources: resolution reached"]
-    assert made.heads == ("", "injected", "recovered", "", "offset", "width", "width", "width")
+    assert made.heads == ("", "injected", "recovered", "recovered", "offset", "width", "width", "width")
     assert made.units == ("", "mJy", "mJy", "%", "arcsec", "arcsec", "natural beams", "briggs beams")
     assert made.rows == (
         ("tsara, 19h59m28.3s +40d44m12s", "20.00", "19.00", "95.00", "0.02000", "0.2500", "0.315", "0.559"),

@@ -49,10 +49,10 @@ def _models(measured):
         ("mdr", "MDR", ""),
         ("fwhm_recovered_arcsec", "width of a point", "arcsec"),
     ]
-    caption = (
-        "MDR: peak of the model over the brightest pixel outside of the source. Width of a point: full width at half "
-        "maximum, in the model, of the brightest unresolved source that stands alone in the truth."
-    )
+    caption = "MDR: peak of the model over the brightest pixel outside of the source."
+    if any("fwhm_recovered_arcsec" in entry for entry in measured.values()):
+        caption += (" Width of a point: full width at half maximum, in the model, of the brightest unresolved source that "
+                    "stands alone in the truth.")
     return build("Models", columns, measured, caption)
 
 
@@ -146,7 +146,7 @@ def _injected(measured, beams):
     }
     rows |= {f"restored images, {name} weighting": {"fwhm_arcsec": width}
              | {other: width / size for other, size in widths.items()} for name, width in widths.items()}
-    columns = [("injected_jy", "injected", "Jy"), ("flux_jy", "recovered", "Jy"), ("percent", "", "%"),
+    columns = [("injected_jy", "injected", "Jy"), ("flux_jy", "recovered", "Jy"), ("percent", "recovered", "%"),
                ("offset_arcsec", "offset", "arcsec"), ("fwhm_arcsec", "width", "arcsec"),
                *((name, "width", f"{name} beams") for name in widths)]
     caption = (
