@@ -15,6 +15,7 @@ from casa_sara.casa.skyimage import SkyPlane
 from casa_sara.imaging import solve_image
 from casa_sara.noise import noise_from_differences
 from casa_sara.options import ImageGrid, Selection, SolverOptions
+from casa_sara.solver.record import STOPPED_BY_USER
 from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
 
 __all__ = ["Injection", "can_be_repeated", "recover"]
@@ -63,6 +64,8 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
     ------
     ValueError
         A source, or the circle around it, is not within the image.
+    KeyboardInterrupt
+        One of the runs was stopped by Ctrl-C.
     """
     plane = one.model.plane
     cell = tuple(size / ARCSEC for size in plane.cell_rad)
@@ -98,6 +101,8 @@ def _repeat(one, places, flux, selection, nthreads):
     models = []
     for vis in (data.vis, data.vis + _visibilities(places, flux, data.uvw, plane)):
         solved = solve_image(replace(data, vis=vis), offsets, noise, selection, grid, options)
+        if solved.record.stop_code == STOPPED_BY_USER:  # half a run says nothing of the resolution
+            raise KeyboardInterrupt
         models.append(solved.model)
     return models
 

@@ -1,5 +1,6 @@
 """The comparison as a user calls it: products in, measures out, and every refusal."""
 
+import dataclasses
 import json
 import os
 import re
@@ -20,15 +21,15 @@ from test_shell import SCRIPT
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import jsonfile, saracompare, tsara
+from casa_sara import injection, jsonfile, saracompare, tsara
 from casa_sara.analysis import metrics
 from casa_sara.casa.imagesets import read_image_set
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.skyimage import read_header, read_sky_image
 from casa_sara.casa.weights import imaging_weights
 from casa_sara.compare import compare_images
-from casa_sara.injection import _repeat as repeat
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
+from casa_sara.solver.record import STOPPED_BY_USER
 from casa_sara.tasks import saracompare as compare_task
 from casa_sara.tasks import tsara as tsara_task
 
@@ -47,7 +48,8 @@ def write(name, pixels, unit="Jy/pixel", cell=0.5, centre=CENTRE, beam=None, fra
     csys.setunits(["rad", "rad", "", "Hz"])
     csys.setreferencevalue(list(centre), "direction")
     csys.setreferencepixel([n // 2 for n in pixels.shape], "direction")
-    csys.setincrement([-cell * ARCSEC, cell * ARCSEC], "direction")
+    wide, high = np.broadcast_to(cell, 2) * ARCSEC
+    csys.setincrement([-float(wide), float(high)], "direction")
     csys.setreferencevalue(8.4e9, "spectral")
     ia = casatools.image()
     pixels = np.asarray(pixels, np.float32)[:, :, None, None]
@@ -422,10 +424,24 @@ def test_a_run_is_repeated_to_the_last_digits(deep):
     """Parameters in the history are all that a run needs: without a source the same model comes out."""
     vis, root = deep
     one = read_image_set(root)
-    without, with_source = repeat(one, [(90, 40)], 0.3, Selection((vis,), datacolumn="data"), 1)
+    without, with_source = injection._repeat(one, [(90, 40)], 0.3, Selection((vis,), datacolumn="data"), 1)
     peak = one.model.pixels.max()
     np.testing.assert_allclose(without, one.model.pixels, atol=1e-4 * peak)
     assert np.abs(with_source - without).max() > 0.1 * peak
+
+
+def test_a_run_that_is_stopped_measures_nothing(deep, monkeypatch):
+    vis, root = deep
+    solve = injection.solve_image
+
+    def stopped(*arguments):
+        solved = solve(*arguments[:-1], dataclasses.replace(arguments[-1], niter=3))
+        solved.record.stop_code = STOPPED_BY_USER
+        return solved
+
+    monkeypatch.setattr(injection, "solve_image", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        saracompare(models=[root, root], vis=vis, datacolumn="data", inject=EMPTY)
 
 
 # Refusals ---------------------------------------------------------------------------------------
@@ -483,6 +499,7 @@ def test_models_beside_each_other_do_not_overlap(tmp_path):
     (dict(frames=["one", "two"]), ValueError, "frames = .*has no effect without outdir"),
     (dict(frames="one", outdir="new"), ValueError, r"frames = \['one'\]: should be two or more images"),
     (dict(frames=["one", "absent"], outdir="new"), FileNotFoundError, "frames = 'absent': neither it nor"),
+    (dict(frames=["one", "oblong.model"], outdir="new"), ValueError, "frames = .* has pixels of 1 x 0.5 arcsec: should"),
     (dict(frames=["one", "far.model"], outdir="new"), ValueError, "frames = 'far.model' has another centre"),
     (dict(robust=0.5), ValueError, "robust = 0.5 has no effect without vis"),
     (dict(scan="1"), ValueError, "scan = '1' has no effect without vis"),
@@ -498,6 +515,7 @@ def test_bad_parameters_raise_and_name_themselves(tmp_path, parameters, error, m
     product("one")
     product("two", seed=1)
     write("far.model", sky(), centre=FAR)
+    write("oblong.model", sky((64, 128), [(1.0, 0, 0)]), cell=(1.0, 0.5))
     write("all.mask", np.ones((128, 128)), "")
     Path("text.fits").write_text("no image")
     Path("full").mkdir()
