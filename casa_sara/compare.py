@@ -78,8 +78,8 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     regions = region_masks(request.regions, frame)
     injected = places(request.inject, frame, "inject")
     if injected and not (observed and any(can_be_repeated(one) for one in sets)):
-        raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; no "
-                         "other imager is run again")
+        raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; "
+                         "no other imager is run again")
     # one operator
     if observed:
         beams = observed.beams

@@ -326,7 +326,8 @@ def test_a_gaussian_is_recovered_with_its_flux_place_and_width(cell):
     narrow = recovered_point(image, place, fwhm, cell)["flux"]
     assert narrow == pytest.approx(1 - 1 / 16, rel=1e-2)  # beyond one width, of a Gaussian
     beside = recovered_point(image, (place[0] + 1, place[1]), 15.0, cell)
-    assert beside["offset"] == pytest.approx(cell[0], rel=1e-3) and beside["width"] == pytest.approx(found["width"], rel=1e-2)
+    assert beside["offset"] == pytest.approx(cell[0], rel=1e-3)
+    assert beside["width"] == pytest.approx(found["width"], rel=1e-2)
 
 
 def test_one_pixel_is_as_wide_as_the_circle_of_half_its_area():

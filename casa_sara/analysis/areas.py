@@ -99,8 +99,8 @@ def places(texts, frame: Frame, parameter) -> dict[str, tuple[float, float]]:
     """
     found = {}
     for text in texts:
-        wrong = f"{parameter} = '{text}' is not a position: should be right ascension and declination, as '19h59m28.3s " \
-                "+40d44m02s'"
+        wrong = f"{parameter} = '{text}' is not a position: should be right ascension and declination, as " \
+                "'19h59m28.3s +40d44m02s'"
         if len(text.split()) != 2:
             raise ValueError(wrong)
         try:

@@ -41,8 +41,8 @@ def replaced(folder: Path) -> Iterator[Path]:
         names = sorted([*os.listdir(new), LIST])
         (new / LIST).write_text("\n".join(names) + "\n", encoding="utf-8")
         if taken := in_the_way(folder, names):
-            raise FileExistsError(f"'{folder}' holds {', '.join(taken)}, not of an earlier report: choose another folder, "
-                                  "or move it away")
+            raise FileExistsError(f"'{folder}' holds {', '.join(taken)}, not of an earlier report: choose another "
+                                  "folder, or move it away")
         old.mkdir()
         for name in _own(folder):
             os.replace(folder / name, old / name)

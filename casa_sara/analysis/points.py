@@ -41,8 +41,8 @@ def recovered_point(image, place, radius, cell=(1.0, 1.0)) -> dict[str, float]:
     first = np.floor(np.asarray(place) - radius / cell).astype(int)
     last = np.ceil(np.asarray(place) + radius / cell).astype(int)
     if (first < 0).any() or (last >= image.shape).any():
-        raise ValueError(f"place = {tuple(place)}: a circle of {radius:g} around it is not within {image.shape} pixels of "
-                         f"{tuple(cell.tolist())}")
+        raise ValueError(f"place = {tuple(place)}: a circle of {radius:g} around it is not within {image.shape} "
+                         f"pixels of {tuple(cell.tolist())}")
     part = image[first[0] : last[0] + 1, first[1] : last[1] + 1]
     part = np.repeat(np.repeat(part, FINE, axis=0), FINE, axis=1) / FINE**2
     steps = ((np.arange(n) + 0.5) / FINE - 0.5 for n in part.shape)

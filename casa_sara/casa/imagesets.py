@@ -155,8 +155,8 @@ def _model_path(given, parameter):
         if os.path.exists(given + suffix):
             return given + suffix, given
     tried = ", ".join(f"'{given}{suffix}'" for suffix in _NAMES)
-    raise FileNotFoundError(f"{parameter} = '{given}': neither it nor {tried} exists: should be the images' common root, a "
-                            "model image or a FITS file")
+    raise FileNotFoundError(f"{parameter} = '{given}': neither it nor {tried} exists: should be the images' common "
+                            "root, a model image or a FITS file")
 
 
 def _beside(root, kind):

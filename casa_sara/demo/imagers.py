@@ -60,7 +60,7 @@ class Product:
 
 
 def run_tsara(case: Case, name: str = "tsara") -> Product:
-    """Image a case with tsara under a name; its restored and residual images are weighted as tclean's with Briggs −1."""
+    """Image a case with tsara under a name; restored and residual images are weighted as tclean's with Briggs −1."""
     wall, cpu = time.perf_counter(), time.process_time()
     made = tsara(**case.common(name), weighting="briggs", robust=-1.0)
     times = time.perf_counter() - wall, time.process_time() - cpu

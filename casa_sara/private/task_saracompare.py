@@ -31,8 +31,8 @@ def saracompare(**parameters: Any) -> dict[str, Any]:
     if frames and not folder:
         raise ValueError(f"frames = {list(frames)} has no effect without outdir: give outdir, the folder of the report")
     if parameters["injectflux"] and not inject:
-        raise ValueError(f"injectflux = {parameters['injectflux']!r} has no effect without inject: give inject, the places "
-                         "of the sources")
+        raise ValueError(f"injectflux = {parameters['injectflux']!r} has no effect without inject: give inject, the "
+                         "places of the sources")
     request = Comparing(models, names, parameters["truth"], regions, parameters["support"], parameters["threshold"],
                         parameters["robust"], frames, inject, parameters["injectflux"], available_cores())
     comparison = compare_images(request, selection)
