@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+import casa_sara
 from casa_sara.casa import log
 from casa_sara.casa.imageplane import define_image_plane
 from casa_sara.casa.images import read_model
 from casa_sara.casa.modelcolumn import write_model_column
 from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.products import write_products
+from casa_sara.casa.products import CHECKPOINT, write_products
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
 from casa_sara.interrupt import stop_on_interrupt
@@ -19,10 +20,11 @@ from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
+from casa_sara.solver.checkpoint import Checkpoint
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFINISHED
 from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
-__all__ = ["Result", "make_image", "solve_image"]
+__all__ = ["Result", "checkpoint_of", "make_image", "solve_image"]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
@@ -45,6 +47,11 @@ class Result:
     residual_peak: float
     model_flux: float
 
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left for a restart to go on with."""
+        return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
+
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
                output: Output) -> Result:
@@ -55,13 +62,16 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     ValueError, FileNotFoundError, RuntimeError
         For data or parameters that no image can be made of; the message names the task parameter.
     """
+    checkpoint = checkpoint_of(selection, grid, options, output)
+    if output.resume:
+        checkpoint.open()
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
     data.notes.extend(_limits(data, grid))
     for note in data.notes:
         log.warn(note)
     plane = define_image_plane(data, selection, grid)
-    start = read_model(output.startmodel, plane) if output.startmodel else None
+    start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
     # split and weigh
     block_of_sample, blocks = snapshot_blocks(data, output.blocks)
     data, offsets = sort_into_blocks(data, block_of_sample)
@@ -70,7 +80,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
-        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start)
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint)
         model = reconstruction.model
         data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
@@ -104,7 +114,20 @@ def _limits(data, grid):
     return notes
 
 
-def solve_image(data, offsets, noise, selection, grid, options, start=None):
+def checkpoint_of(selection, grid, options, output):
+    """Return the checkpoint of a run, which knows the parameters that decide the model, by the names of the task.
+
+    Where the data are is none of them (they are known by their contents), nor is how many threads there are.
+    """
+    startmodel = output.startmodel if output.startmodel != output.imagename + ".model" else ""  # that of restart = True
+    parameters = asdict(selection) | asdict(grid) | asdict(options) | dict(blocks=output.blocks, startmodel=startmodel)
+    parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
+    for name in ("vis", "nthreads"):
+        del parameters[name]
+    return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
+
+
+def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None):
     """Reconstruct block-sorted visibilities, with progress in the log and Ctrl-C as the wish to stop.
 
     Parameters
@@ -120,6 +143,8 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None):
     options : SolverOptions
     start : float32 (nx, ny), optional
         First model, Jy/pixel.
+    checkpoint : Checkpoint, optional
+        Where the state is kept now and then, or was.
 
     Returns
     -------
@@ -135,11 +160,14 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None):
                  f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
 
     with stop_on_interrupt() as stopped:
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped)
+        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped,
+                                     checkpoint)
     progress.close()
     record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
+    if record.stop_code in UNFINISHED:
+        log.info(f"restart = True goes on from '{checkpoint.path}'")
     released = sum(update["released"] for update in record.reweightings)
     if released:
         log.info(f"{released} pixels beside unresolved sources were allowed to be negative: the sources are between pixels")

@@ -91,7 +91,8 @@ class SolverOptions:
 class Output:
     """Where results go, and what goes along.
 
-    `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image.
+    `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image;
+    `resume` says to go on from the checkpoint.
     """
 
     imagename: str
@@ -100,6 +101,7 @@ class Output:
     restoringbeam: tuple[str, ...] | None = ()
     savemodel: str = "none"
     history: tuple[str, ...] = ()
+    resume: bool = False
 
 
 @dataclass(frozen=True)

@@ -15,11 +15,12 @@ from casa_sara.casa.restore import restore
 from casa_sara.casa.tools import opened
 
 __all__ = [
-    "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products", "remove_products",
+    "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products", "remove_products",
     "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
+CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # written last, by the task; the report is a folder
 
 
