@@ -15,6 +15,7 @@ __all__ = ["Checkpoint"]
 
 INTERVAL = 60.0  # s between two checkpoints, at least
 PATIENCE = 60  # times what writing one takes: less than 2 % of the run
+HEADER = dict(version=str, parameters=dict, data=dict, iteration=int, written=float)
 
 
 class Checkpoint:
@@ -51,13 +52,14 @@ class Checkpoint:
         """
         try:
             found, state = read(self.path)
+            for name, kind in HEADER.items():
+                if not isinstance(found.get(name), kind):
+                    raise CheckpointError(f"its header lacks '{name}'")
             for name in ("version", "parameters"):
                 self._compare(name, found[name], self._header[name])
             self._found, self.state = found, state
         except CheckpointError as error:
             raise self._refusal(error) from None
-        except (KeyError, TypeError, AttributeError) as error:
-            raise self._refusal(f"its header lacks what it should have ({error!r})") from None
 
     def identify(self, **data):
         """Say what the data are, by arrays or None, and hold that against what was read.
@@ -80,7 +82,7 @@ class Checkpoint:
         """Yield `state`, to be put to use: what does not fit is a reason to refuse it; afterwards it is let go."""
         try:
             yield self.state
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise self._refusal(f"its state does not fit ({error})") from None
         age = time.time() - self._found["written"]
         self.tell(f"resuming from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")

@@ -54,7 +54,7 @@ class Release:
         before = np.count_nonzero(ppd.lowest)
         lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around)
-        return int(np.count_nonzero(ppd.lowest)) - before
+        return int(np.count_nonzero(ppd.lowest) - before)
 
     def state(self):
         """Return what the next call depends on."""
