@@ -155,7 +155,8 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     expected = schedule_of(options).expected_iterations
 
     def report(ppd, record):
-        fraction = min(ppd.iteration / expected, 0.999)
+        begun = record.resumed[-1] if record.resumed else 0
+        fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
         progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
                  f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
 

@@ -30,7 +30,7 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         if asked.is_set() and not requested.is_set():
             requested.set()
             return
-        signal.signal(number, before[number])
+        signal.signal(number, before[number] or signal.SIG_DFL)
         signal.raise_signal(number)
 
     if threading.current_thread() is not threading.main_thread():
@@ -41,4 +41,4 @@ def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
         yield stopped
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            signal.signal(number, handler or signal.SIG_DFL)  # None: not Python's own

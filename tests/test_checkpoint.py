@@ -23,7 +23,7 @@ from casa_sara.solver import checkpoint as module
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
-from casa_sara.solver.record import CONVERGED, STOPPED_BY_USER
+from casa_sara.solver.record import CONVERGED, STOPPED_BY_USER, UNFEASIBLE
 from casa_sara.solver.reweighting import Schedule, Stage, solve
 from casa_sara.solver.statefile import MAGIC, CheckpointError, read, write
 
@@ -215,6 +215,9 @@ def solved(problem, adaptive, path, interrupt_at):
         else:
             ppd.set_state(start["ppd"])
             bounds.set_state(start["bounds"])
+            for one, kept in ((ppd, start["ppd"]), (bounds, start["bounds"])):
+                assert one.state().keys() == kept.keys()
+                assert all(np.array_equal(value, kept[name]) for name, value in one.state().items())
             start = Stage.of(start["stage"])
 
         def keep(stage, now):
@@ -248,6 +251,15 @@ def test_an_interrupted_solution_ends_at_the_same_image(tmp_path, adaptive):
     assert_same(solved(problem, adaptive, path, moments), wanted, moments)
     for one in np.random.default_rng(3).choice(moments, 4, replace=False):
         assert_same(solved(problem, adaptive, path, [int(one)]), wanted, [int(one)])
+
+
+def test_patience_with_bounds_that_cannot_be_met_goes_on(tmp_path):
+    problem, path = Problem(seed=14, samples=(20, 30), noise=(1.0, 1.0)), str(tmp_path / "c")
+    problem.errors = 0.01 * problem.errors
+    wanted = solved(problem, False, path, ())
+    end = wanted[1].iteration[-1]
+    assert wanted[1].stop_code == UNFEASIBLE
+    assert_same(solved(problem, False, path, [end - 150]), wanted, [end - 150])
 
 
 GRID = ImageGrid((40, 48), (1e-6, 1e-6))
@@ -293,10 +305,14 @@ def test_a_reconstruction_goes_on_with_all_that_was_found(sky, tmp_path, monkeyp
     stopped = image(sky, path, 37)
     assert stopped.record.stop_code == STOPPED_BY_USER and stopped.record.iteration[-1] == 37
     monkeypatch.setattr("casa_sara.problem.nnls", None)  # not needed any more
-    last = [update["iteration"] for update in wanted.record.reweightings][-2] + 5  # pixels are released, errors shared
-    assert image(sky, path, last).record.resumed == [37]
+    updates = [update["iteration"] for update in wanted.record.reweightings]
+    releases = np.flatnonzero([update["released"] for update in wanted.record.reweightings])
+    middle = updates[releases[0] - 1] + 5  # pixels have asked once to be released
+    last = updates[-1] + 5  # they are, and errors shared
+    assert image(sky, path, middle).record.resumed == [37]
+    assert image(sky, path, last).record.resumed == [37, middle]
     found = image(sky, path)
-    assert_same((found.model, found.record), (wanted.model, wanted.record), [37, last])
+    assert_same((found.model, found.record), (wanted.model, wanted.record), [37, middle, last])
     for name in ("l2_bounds", "residual_norms", "nnls_norms", "kept"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
     for name in ("wild", "threshold", "data_norm_sq", "noise_jy_per_beam"):

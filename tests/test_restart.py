@@ -178,7 +178,7 @@ def stopped(vis, tmp_path, monkeypatch):
     return name
 
 
-def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, tmp_path_factory, monkeypatch):
+def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, uninterrupted, tmp_path_factory, monkeypatch):
     path = Path(stopped + ".checkpoint")
     good = path.read_bytes()
     before = _hashes(path.parent)
@@ -212,6 +212,8 @@ def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, tmp_p
     shutil.copytree(vis, moved)
     result = tsara(**(GRID | dict(vis=moved, imagename=stopped, restart=True, nthreads=2, weighting="uniform")))
     assert result["sara"]["resumed"] == [12] and not path.exists()
+    wanted = _pixels(uninterrupted[1] + ".model")
+    np.testing.assert_allclose(_pixels(stopped + ".model"), wanted, rtol=0, atol=1e-6 * wanted.max())
 
 
 def test_a_second_ctrl_c_aborts_at_once(vis, tmp_path, monkeypatch):

@@ -285,7 +285,6 @@ def test_corrected_column_absent_is_said_loudly(vis, tmp_path):
     (dict(databound="fixed"), "l2bound"),
     (dict(databound="fixed", l2bound=[-1.0]), "l2bound"),
     (dict(databound="fixed", l2bound=[1.0, 2.0, 3.0]), "l2bound"),
-    (dict(restart=True), "restart"),
     (dict(startmodel="absent.model"), "startmodel"),
     (dict(parallel=True), "parallel"),
     (dict(blocks=-1), "blocks"),

@@ -15,8 +15,8 @@ from casa_sara.casa.restore import restore
 from casa_sara.casa.tools import opened
 
 __all__ = [
-    "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products", "remove_products",
-    "write_products",
+    "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
+    "remove_products", "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
