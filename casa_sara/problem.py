@@ -77,7 +77,23 @@ class Problem:
 
 
 def first_image(samples, problem_of, options):
-    """Positivity and a vanishing sparsity alone: where the bounds start, and the model too; wild samples are left out."""
+    """Find the image of positivity and a vanishing sparsity alone, where the bounds start, and the model too.
+
+    Parameters
+    ----------
+    samples : Samples
+    problem_of : callable
+        Makes the `Problem` of samples.
+    options : SolverOptions
+
+    Returns
+    -------
+    problem : Problem
+        Without the wild samples.
+    found : Findings
+    first : real (nx, ny)
+        In `problem.unit_jy`.
+    """
     everything, wild = samples.data.size, []
     for _ in range(ROUNDS):
         problem = problem_of(samples)

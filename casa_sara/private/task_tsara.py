@@ -112,8 +112,8 @@ def _output(parameters, grid):
         if not unfinished:
             startmodel = _model_to_continue(imagename, startmodel, old)
     elif unfinished and not parameters["overwrite"]:
-        raise FileExistsError(f"imagename = '{imagename}': a run that has not finished left '{checkpoint}'; choose another "
-                              "name, restart = True to go on from it, or overwrite = True to begin anew")
+        raise FileExistsError(f"imagename = '{imagename}': a run that has not finished left '{checkpoint}'; choose "
+                              "another name, restart = True to go on from it, or overwrite = True to begin anew")
     elif old and not parameters["overwrite"]:
         raise FileExistsError(f"imagename = '{imagename}': {', '.join(old)} exist; choose another name, "
                               "overwrite = True to replace them, or restart = True to continue from the model")
@@ -126,7 +126,8 @@ def _model_to_continue(imagename, startmodel, old):
     """Return the first model of a restart without a checkpoint: the old model, where there is one."""
     model = imagename + ".model"
     if model not in old:
-        log.info(f"restart = True: there is neither '{imagename + CHECKPOINT}' nor '{model}': starting from the beginning")
+        log.info(f"restart = True: there is neither '{imagename + CHECKPOINT}' nor '{model}': "
+                 "starting from the beginning")
         return startmodel
     if startmodel:
         raise ValueError(f"startmodel = '{startmodel}' and restart = True both give the first model: set only one")

@@ -160,7 +160,13 @@ class AdaptivePPD:
         self.threshold = float(threshold)
 
     def state(self):
-        """Return all that the next step depends on beside the constructor's arguments: plain values, and the arrays themselves."""
+        """Return all that the next step depends on, beside the constructor's arguments.
+
+        Returns
+        -------
+        dict
+            Plain values, and the arrays themselves.
+        """
         arrays = {name: getattr(self, name) for name in STATE_ARRAYS}
         return arrays | {name: getattr(self, name) for name in STATE_VALUES} | dict(l2_bounds=self.l2_bounds)
 

@@ -73,7 +73,8 @@ class Checkpoint:
                                 for name, values in data.items()}
         self._due = time.monotonic() + INTERVAL
         if self.state is not None:
-            different = [name for name, digest in self._header["data"].items() if self._found["data"].get(name) != digest]
+            found = self._found["data"]
+            different = [name for name, value in self._header["data"].items() if found.get(name) != value]
             if different:
                 raise self._refusal(f"it is of other data: {', '.join(different)} differ")
 
@@ -122,5 +123,5 @@ class Checkpoint:
         raise CheckpointError(f"it is of another {name} of casa_sara: {found}, and this is {wanted}")
 
     def _refusal(self, reason):
-        return CheckpointError(f"restart = True: '{self.path}' cannot be resumed: {reason}. Run as it was begun, or set "
-                               "restart = False and overwrite = True to begin anew, or choose another imagename")
+        return CheckpointError(f"restart = True: '{self.path}' cannot be resumed: {reason}. Run as it was begun, or "
+                               "set restart = False and overwrite = True to begin anew, or choose another imagename")

@@ -113,8 +113,10 @@ def read(path):
         place += _DIGEST
         for entry in listed:
             place = _join(state, entry, raw, place)
+    except CheckpointError:
+        raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise error if isinstance(error, CheckpointError) else CheckpointError(f"its header is none ({error!r})") from None
+        raise CheckpointError(f"its header is none ({error!r})") from None
     if place != raw.size:
         raise CheckpointError("it is damaged: more bytes than its arrays have")
     return header, state
