@@ -167,7 +167,7 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
-    if record.stop_code in UNFINISHED:
+    if checkpoint and record.stop_code in UNFINISHED:
         log.info(f"restart = True goes on from '{checkpoint.path}'")
     released = sum(update["released"] for update in record.reweightings)
     if released:
