@@ -7,12 +7,13 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+import casa_sara
 from casa_sara.casa import log
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
 from casa_sara.casa.modelcolumn import save_model_column, write_model_column
 from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.products import write_products
+from casa_sara.casa.products import CHECKPOINT, write_products
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
@@ -21,10 +22,11 @@ from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
+from casa_sara.solver.checkpoint import Checkpoint
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFINISHED
 from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
-__all__ = ["Result", "make_image", "write_column"]
+__all__ = ["Result", "checkpoint_of", "make_image", "solve_image", "write_column"]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
@@ -47,6 +49,11 @@ class Result:
     residual_peak: float
     model_flux: float
 
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left for a restart to go on with."""
+        return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
+
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
                output: Output, record: Callable[[Result], dict] | None = None) -> Result:
@@ -64,13 +71,16 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     ValueError, FileNotFoundError, RuntimeError
         For data or parameters that no image can be made of; the message names the task parameter.
     """
+    checkpoint = checkpoint_of(selection, grid, options, output)
+    if output.resume:
+        checkpoint.open()
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
     data.notes.extend(_limits(data, grid))
     for note in data.notes:
         log.warn(note)
     plane = define_image_plane(data, selection, grid)
-    start = read_model(output.startmodel, plane) if output.startmodel else None
+    start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
     if output.images_stand:
         _save_model(selection, data, grid, options, start)
         return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)))
@@ -82,8 +92,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
-        density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
-        reconstruction = _solve(data, offsets, density, grid, options, noise, start)
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint)
         model = reconstruction.model
         data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
@@ -95,6 +104,8 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     images = dict(psf=psf, residual=residual, model=model)
     result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
     write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result))
+    if result.finished:
+        checkpoint.remove()
     if output.savemodel == "modelcolumn":
         _save_model(selection, data, grid, options, model)
     return result
@@ -135,22 +146,61 @@ def _limits(data, grid):
     return notes
 
 
-def _solve(data, offsets, density, grid, options, noise, start):
-    """Reconstruct, with progress in the log and Ctrl-C as the wish to stop."""
+def checkpoint_of(selection, grid, options, output):
+    """Return the checkpoint of a run, which knows the parameters that decide the model, by the names of the task.
+
+    Where the data are is none of them (they are known by their contents), nor is how many threads there are.
+    """
+    startmodel = output.startmodel if output.startmodel != output.imagename + ".model" else ""  # that of restart = True
+    parameters = asdict(selection) | asdict(grid) | asdict(options) | dict(blocks=output.blocks, startmodel=startmodel)
+    parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
+    for name in ("vis", "nthreads"):
+        del parameters[name]
+    return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
+
+
+def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None):
+    """Reconstruct block-sorted visibilities, with progress in the log and Ctrl-C as the wish to stop.
+
+    Parameters
+    ----------
+    data : Visibilities
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    noise : float (d,)
+        Measured in the data, in units of what the weights say; NaN where unknown.
+    selection : Selection
+        That gave the data, for their sampling density.
+    grid : ImageGrid
+    options : SolverOptions
+    start : float32 (nx, ny), optional
+        First model, Jy/pixel.
+    checkpoint : Checkpoint, optional
+        Where the state is kept now and then, or was.
+
+    Returns
+    -------
+    Reconstruction
+    """
+    density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
     progress = log.Progress()
     expected = schedule_of(options).expected_iterations
 
     def report(ppd, record):
-        fraction = min(ppd.iteration / expected, 0.999)
+        begun = record.resumed[-1] if record.resumed else 0
+        fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
         progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
                  f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
 
     with stop_on_interrupt() as stopped:
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped)
+        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped,
+                                     checkpoint)
     progress.close()
     record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
+    if checkpoint and record.stop_code in UNFINISHED:
+        log.info(f"restart = True goes on from '{checkpoint.path}'")
     released = sum(update["released"] for update in record.reweightings)
     if released:
         log.info(f"{released} pixels beside unresolved sources were allowed to be negative: the sources are between pixels")

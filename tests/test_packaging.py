@@ -31,6 +31,7 @@ ROOMS = {
         "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
     },
     "interrupt": set(),
+    "problem": {"casa_sara.operators", "casa_sara.outliers", "casa_sara.solver", "casa_sara.visibilities", "numpy"},
     "resources": set(),
     "options": set(),
     "visibilities": {"numpy"},
@@ -41,16 +42,18 @@ ROOMS = {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },
     "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
-    "analysis": {"numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
+    "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
     "jsonfile": set(),
 }
-LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")
+LIBRARY = ("options", "visibilities", "noise", "outliers", "problem", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
-ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.jsonfile", "numpy", *NUMERICS}
+ROOMS["imaging"] = {"casa_sara", "casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
+ROOMS["injection"] = {"casa_sara.casa", "casa_sara.imaging", "numpy", *NUMERICS}
+ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "numpy", *NUMERICS}
 ROOMS["demo"] = {
-    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS,
+    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "casa_sara.resources", "numpy", "finufft",
+    "matplotlib", *NUMERICS,
     *CASA,
 }
 

@@ -25,11 +25,13 @@ from casa_sara.casa.tools import opened
 from casa_sara.interrupt import signals_deferred
 
 __all__ = [
-    "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products", "recover_products",
+    "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
+    "recover_products",
     "remove_products", "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
+CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
 
 
@@ -81,7 +83,8 @@ def _folder_of(imagename, stage):
 def new_products(imagename):
     """Yield the name under which to write the products; they take their places when all are complete.
 
-    Those of an older run are replaced, all together; when something fails, everything stays as it was.
+    Those of an older run are replaced, all together; when something fails, everything stays as it was. The folder
+    of the report, where others may have put files, is left to who writes reports.
     """
     recover_products(imagename)
     new = _folder_of(imagename, ".new")
@@ -108,7 +111,8 @@ def _take_places(imagename):
     if os.path.isdir(whole):  # what stands under the name is older
         os.makedirs(old, exist_ok=True)
         for path in existing_products(imagename):
-            os.rename(path, os.path.join(old, os.path.basename(path)))
+            if not path.endswith(REPORT):
+                os.rename(path, os.path.join(old, os.path.basename(path)))
         os.rename(whole, moving)
     if os.path.isdir(moving):
         for name in os.listdir(moving):
