@@ -92,7 +92,9 @@ class SolverOptions:
 class Output:
     """Where results go, and what goes along.
 
-    `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image.
+    `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image;
+    `resume` says to go on from the checkpoint. With `images_stand` the products of an earlier run stay as they are, and
+    only the model column is written.
     """
 
     imagename: str
@@ -100,7 +102,9 @@ class Output:
     blocks: int = 0
     restoringbeam: tuple[str, ...] | None = ()
     savemodel: str = "none"
+    images_stand: bool = False
     history: tuple[str, ...] = ()
+    resume: bool = False
 
 
 @dataclass(frozen=True)
@@ -127,4 +131,7 @@ class Comparing:
     support: str = ""
     threshold: float = 1e-3
     robust: float = -1.0
+    frames: tuple[str, ...] = ()
+    inject: tuple[str, ...] = ()
+    injectflux: float = 0.0
     nthreads: int = 1

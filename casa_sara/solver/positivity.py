@@ -32,7 +32,7 @@ class Release:
     """
 
     def __init__(self):
-        self._wanted_before = False
+        self._wanted_before = np.zeros((), bool)
 
     def update(self, ppd, bounds):
         """Release what the residual of the present model asks for.
@@ -56,7 +56,15 @@ class Release:
         before = np.count_nonzero(ppd.lowest)
         lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around)
-        return int(np.count_nonzero(ppd.lowest)) - before
+        return int(np.count_nonzero(ppd.lowest) - before)
+
+    def state(self):
+        """Return what the next call depends on."""
+        return dict(wanted_before=self._wanted_before)
+
+    def set_state(self, state):
+        """Take over what :meth:`state` has returned."""
+        self._wanted_before = np.array(state["wanted_before"])
 
 
 def _wanted(ppd, bounds):

@@ -54,7 +54,7 @@ PARAMETERS = (
     Parameter('maxtime', ('string', 'int', 'double'), '', "Longest time to take, as '2h', or in minutes; '': no limit"),
     Parameter('fullsummary', ('bool',), False, 'Return dictionary with complete convergence history'),
     Parameter('report', ('bool',), False, 'Write a report of the run, imagename.report/report.html'),
-    Parameter('restart', ('bool',), False, 'Continue from imagename.model'),
+    Parameter('restart', ('bool',), False, 'Go on from imagename.checkpoint, or else continue from imagename.model'),
     Parameter('overwrite', ('bool',), False, 'Replace existing images'),
     Parameter('savemodel', ('string',), 'none', 'Options to save model visibilities (none, modelcolumn)', allowed=('none', 'modelcolumn')),
     Parameter('parallel', ('bool',), False, 'Run on several processes', allowed=(False,)),
@@ -161,6 +161,7 @@ class _tsara:
           out/try.pb        the primary beam
           out/try.sumwt     the sum of the imaging weights
           out/try.sara.json the record 'sara' of the returned dictionary, with every iteration
+        and, as long as the run has not finished, out/try.checkpoint, from which restart=True goes on.
         Images that exist are left alone, and the task refuses to start, unless restart or
         overwrite says otherwise.
 
@@ -368,16 +369,26 @@ class _tsara:
         beside it. The task saracompare writes the same for several images.
 
     restart : bool, default False
-        True starts from the existing imagename.model and replaces the products; the model must
-        have the shape and coordinates asked for. False starts afresh.
+        True goes on with a run that has not finished, because it was killed, the machine went down,
+        or Ctrl-C ended it: from imagename.checkpoint, which is written every minute or so, and to
+        the same image as without the interruption. It takes the same data and the same parameters
+        (nthreads and those of the weighting, the restoration and the output are free; the
+        MeasurementSets may have been moved); another checkpoint is refused, and what differs is
+        said. Where there is no checkpoint, True starts from imagename.model, which must have the
+        shape and coordinates asked for; where there is none either, from the beginning. The
+        products are replaced. With niter=0 and savemodel='modelcolumn' they stay as they are, and
+        only the column is written. False starts afresh.
 
     overwrite : bool, default False
-        True lets the task replace products of an earlier run with the same imagename. False
-        refuses to start when there are any, unless restart=True.
+        True lets the task replace products of an earlier run with the same imagename, and its
+        checkpoint when it has not finished: when there are new ones. False refuses to start when
+        there are any, unless restart=True.
 
     savemodel : {'none', 'modelcolumn'}, default 'none'
         'modelcolumn' writes the visibilities of the model into MODEL_DATA of each MeasurementSet,
-        for self-calibration. 'none' leaves the MeasurementSets untouched.
+        for self-calibration, when the images are complete. 'none' leaves the MeasurementSets
+        untouched. Together with restart=True and niter=0 it writes the visibilities of the existing
+        imagename.model and leaves the images as they are: also where a run was killed in this phase.
 
     parallel : {False}, default False
         Only False: the task runs in one process, with nthreads threads.
@@ -389,8 +400,8 @@ class _tsara:
       summaryminor. Stop codes: 101 converged, 102 iteration limit, 103 noise only, 104 stopped by
       user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit. The key 'sara' holds its own record: the
       bound of each block with its snapshot, the history of re-weightings and iterations, the
-      parameters that were chosen automatically and why, and how many samples were dropped for
-      which reason.
+      parameters that were chosen automatically and why, how many samples were dropped for
+      which reason, and the iterations from which the run was resumed ('resumed').
 
     Examples
     --------
