@@ -7,33 +7,31 @@ written) over the copy bandwidth, and the multiplications and additions of the f
 """
 
 import argparse
-import os
-import platform
-import time
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pywt
-from numba import njit
 
-from casa_sara.operators._simd import VECTOR_BYTES, load, splat, store
-from casa_sara.operators._workers import Workers
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from machine import bandwidth, machine, peak, seconds, spread
+
 from casa_sara.operators.dictionary import SaraDictionary
 
 LEVELS = 4
 THRESHOLD = np.float32(0.1)
 MODE = {"mode": "periodization"}
-CHAINS = 12  # independent multiply-adds, enough to hide their latency
 
 
 class PyWaveletsStep:
-    """The prior step on PyWavelets, the bases shared out to threads."""
+    """The prior step on PyWavelets, the bases shared out to threads: dual ← dual + ρ(clip(dual + Ψ†x, ±κ) − dual)."""
 
-    def __init__(self, shape, wavelets, nthreads):
-        self.gain = np.float32(1 / np.sqrt(len(wavelets)))
+    def __init__(self, shape, wavelets, nthreads, dtype=np.float32, threshold=THRESHOLD, relaxation=1.0):
+        self.gain, self.threshold, self.relaxation = (dtype(x) for x in (len(wavelets) ** -0.5, threshold, relaxation))
         self.wavelets = wavelets
-        zero = np.zeros(shape, np.float32)
+        zero = np.zeros(shape, dtype)
         self.dual = [zero.copy() if name == "dirac" else pywt.wavedec2(zero, name, level=LEVELS, **MODE)
                      for name in wavelets]
         self.pool = ThreadPoolExecutor(nthreads)
@@ -55,53 +53,14 @@ class PyWaveletsStep:
 
     def update(self, dual, fresh):
         fresh *= self.gain
-        dual += fresh
-        np.clip(dual, -THRESHOLD, THRESHOLD, out=dual)
-
-
-@njit(nogil=True)
-def copy(source, to, worker, workers):
-    """Copy this worker's share of an array, a vector at a time."""
-    like = splat(source[0])
-    share = source.nbytes // workers // VECTOR_BYTES * VECTOR_BYTES
-    for k in range(worker * share, (worker + 1) * share, VECTOR_BYTES):
-        store(to.ctypes.data + k, load(source.ctypes.data + k, like))
-
-
-@njit(nogil=True, fastmath={"contract"})
-def multiply_add(rounds, result, worker, workers):
-    """CHAINS independent chains of multiply-adds in registers."""
-    m = splat(result[0])
-    a = b = c = d = e = f = g = h = i = j = k = q = m
-    for _ in range(rounds):
-        a, b, c, d = a * m + m, b * m + m, c * m + m, d * m + m
-        e, f, g, h = e * m + m, f * m + m, g * m + m, h * m + m
-        i, j, k, q = i * m + m, j * m + m, k * m + m, q * m + m
-    total = ((a + b) + (c + d)) + ((e + f) + (g + h)) + ((i + j) + (k + q))
-    store(result.ctypes.data + worker * VECTOR_BYTES, total)
-
-
-def seconds(function, *args):
-    begin = time.perf_counter()
-    function(*args)
-    return time.perf_counter() - begin
-
-
-def bandwidth(nthreads, repeat, megabytes=256):
-    """Copy bandwidth in bytes/s, read and written bytes counted."""
-    source, to = (np.ones(megabytes << 18, np.float32) for _ in range(2))
-    workers = Workers(nthreads)
-    workers.run(copy, source, to)
-    return 2 * source.nbytes / np.median([seconds(workers.run, copy, source, to) for _ in range(repeat)])
-
-
-def peak(nthreads, repeat, rounds=300_000):
-    """Multiplications and additions per second in single precision."""
-    result = np.full(nthreads * VECTOR_BYTES // 4, 0.5, np.float32)
-    workers = Workers(nthreads)
-    workers.run(multiply_add, 1, result)
-    flops = 2 * CHAINS * rounds * VECTOR_BYTES // 4 * nthreads
-    return flops / np.median([seconds(workers.run, multiply_add, rounds, result) for _ in range(repeat)])
+        fresh += dual
+        np.clip(fresh, -self.threshold, self.threshold, out=fresh)
+        if self.relaxation == 1:
+            dual[...] = fresh
+        else:
+            fresh -= dual
+            fresh *= self.relaxation
+            dual += fresh
 
 
 def filter_flops(shape, wavelets):
@@ -111,7 +70,7 @@ def filter_flops(shape, wavelets):
 
 
 def time_size(shape, threads, repeat, slow_repeat):
-    """Medians and quartiles in seconds for each number of threads: ours, with weights, PyWavelets."""
+    """Seconds of every repetition for each number of threads: ours, with weights, PyWavelets."""
     image = np.random.default_rng(0).normal(size=shape).astype(np.float32)
     out = np.empty_like(image)
     ours = {n: SaraDictionary(shape, levels=LEVELS, nthreads=n) for n in threads}
@@ -128,13 +87,7 @@ def time_size(shape, threads, repeat, slow_repeat):
             times["weighted", n].append(seconds(ours[n].dual_step, image, dual, THRESHOLD, weights, out))
             if turn < slow_repeat:
                 times["pywt", n].append(seconds(theirs[n], image))
-    return {key: np.percentile(values, (50, 25, 75)) for key, values in times.items()}, ours[first]
-
-
-def machine():
-    model = next((line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
-                  if line.startswith("model name")), platform.processor()) if os.path.exists("/proc/cpuinfo") else ""
-    return f"{model or platform.machine()}, {os.cpu_count()} cores, vectors of {VECTOR_BYTES} bytes"
+    return times, ours[first]
 
 
 def main():
@@ -158,11 +111,10 @@ def main():
         for n in options.threads:
             step, theirs = times["plain", n], times["pywt", n]
             floors = 1e3 * moved / rates[n][0], 1e3 * filter_flops(shape, dictionary.wavelets) / rates[n][1]
-            spread = [f"{1e3 * t[0]:.1f} ({1e3 * t[1]:.1f}–{1e3 * t[2]:.1f})"
-                      for t in (step, times["weighted", n], theirs)]
-            print(f"| {size} | {n} | {' | '.join(spread)} | {theirs[0] / step[0]:.0f} "
-                  f"| {times['pywt', options.threads[0]][0] / step[0]:.0f} | {floors[0]:.1f} ms | {floors[1]:.1f} ms "
-                  f"| {1e3 * step[0] / max(floors):.1f} |", flush=True)
+            words = [spread(t) for t in (step, times["weighted", n], theirs)]
+            ours, same, one = (np.median(t) for t in (step, theirs, times["pywt", options.threads[0]]))
+            print(f"| {size} | {n} | {' | '.join(words)} | {same / ours:.0f} | {one / ours:.0f} "
+                  f"| {floors[0]:.1f} ms | {floors[1]:.1f} ms | {1e3 * ours / max(floors):.1f} |", flush=True)
 
 
 if __name__ == "__main__":

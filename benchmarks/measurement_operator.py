@@ -11,12 +11,17 @@ must touch (image, grid, points and visibilities, once each) at the bandwidth me
 from __future__ import annotations
 
 import argparse
-import platform
+import sys
 import time
+from pathlib import Path
 
 import ducc0
 import finufft
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+from machine import bandwidth, machine
 
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.decimation import (
@@ -143,28 +148,6 @@ def contestants(uv, cell, shape, nthreads):
     yield "finufft, double, its default 1e-6", Finufft(*common, 1e-6, "f8", nthreads)
 
 
-def processor():
-    """Name of the processor, where the system tells."""
-    try:
-        with open("/proc/cpuinfo") as lines:
-            names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-        return f"{names[0]} × {len(names)}"
-    except (OSError, IndexError):
-        return platform.machine()
-
-
-def bandwidth():
-    """Bytes per second of a copy that does not fit the caches."""
-    source = np.ones(1 << 26)
-    target = source.copy()
-    times = []
-    for _ in range(3):
-        start = time.perf_counter()
-        np.copyto(target, source)
-        times.append(time.perf_counter() - start)
-    return 2 * source.nbytes / min(times)
-
-
 def floor_bytes(operator):
     """Bytes that one forward and one adjoint touch at least."""
     grid = operator._nufft.grid.nbytes
@@ -215,8 +198,8 @@ def main():
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--cases", type=int, default=len(CASES))
     options = parser.parse_args()
-    bytes_per_s = bandwidth()
-    print(f"{processor()}, {options.threads} thread(s), copy {bytes_per_s / 1e9:.1f} GB/s, "
+    bytes_per_s = bandwidth(options.threads, options.repeats)
+    print(f"{machine()}, {options.threads} thread(s), copy {bytes_per_s / 1e9:.1f} GB/s, "
           f"finufft {finufft.__version__}, ducc0 {ducc0.__version__}\n")
     print("| image, visibilities | operator | forward + adjoint, ms | ratio | error | floor, ms |")
     print("|---|---|---|---|---|---|")

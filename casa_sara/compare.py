@@ -9,22 +9,24 @@ import numpy as np
 
 import casa_sara
 from casa_sara.analysis import metrics
-from casa_sara.analysis.areas import Frame, region_masks
+from casa_sara.analysis.areas import Frame, places, region_masks
 from casa_sara.analysis.comparison import Comparison, Product
 from casa_sara.analysis.measuring import measure, source_support
 from casa_sara.casa import log
 from casa_sara.casa.imageplane import define_image_plane
-from casa_sara.casa.imagesets import check_same_data, data_names, read_image_set
+from casa_sara.casa.imagesets import check_same_data, data_names, read_frames, read_image_set
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.skyimage import SkyPlane, beam_numbers, read_sky_image
 from casa_sara.casa.weights import dirty_image, imaging_weights
+from casa_sara.injection import Injection, can_be_repeated, recover
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
 from casa_sara.visibilities import snapshot_blocks
 
 __all__ = ["compare_images"]
 
+INJECTED = 100.0  # flux of an injected source, in units of the noise per beam with natural weights
 IMAGE_EPS = 1e-6  # accuracy of the residual images
 LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a word
 ARCSEC = np.radians(1 / 3600)
@@ -61,6 +63,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or B1950")
     if RADESYS[first.plane.frame] == "FK4":
         notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
+    frames = read_frames(request.frames, first.plane)
     observed = _Observed(selection, first.plane, request, notes) if selection else None
     # one grid
     plane = observed.plane if observed else first.plane
@@ -73,6 +76,10 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     cell_arcsec = tuple((np.array(plane.cell_rad) / ARCSEC).tolist())
     frame = Frame(centre_deg, cell_arcsec, plane.shape, RADESYS[plane.frame])
     regions = region_masks(request.regions, frame)
+    injected = places(request.inject, frame, "inject")
+    if injected and not (observed and any(can_be_repeated(one) for one in sets)):
+        raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; "
+                         "no other imager is run again")
     # one operator
     if observed:
         beams = observed.beams
@@ -88,11 +95,13 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
+    if injected:
+        _inject(injected, plane, request, selection, sets, beams, measures["products"])
     versions = {"casa_sara": casa_sara.__version__} | {name: version(name) for name in VERSIONS}
     for note in notes:
         log.warn(note)
     return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures, versions,
-                      tuple(notes))
+                      tuple(notes), frames)
 
 
 def _read(request, with_residual, fewest):
@@ -174,6 +183,20 @@ def _support(request, plane, frame, models, truth, beam, notes):
     if outside > 0.5:
         notes.append(f"support = '{text}' leaves out a pixel of {100 * outside:.2g} % of a model's peak: is that right?")
     return support
+
+
+def _inject(injected, plane, request, selection, sets, beams, measured):
+    """Add to the measures what became of point sources that were put into the visibilities."""
+    again = [one for one in sets if can_be_repeated(one)]
+    flux = request.injectflux or INJECTED * max(measured[one.name]["natural"]["sigma"] for one in again)
+    widths = {weighting: float(np.sqrt(beam[0] * beam[1])) for weighting, beam in beams.items()}
+    injection = Injection(injected, plane, flux, min(widths.values()))
+    for one in again:
+        found = recover(one, injection, selection, request.nthreads)
+        for source in found.values():
+            if "fwhm_arcsec" in source:
+                source["fwhm_in_beams"] = {name: source["fwhm_arcsec"] / width for name, width in widths.items()}
+        measured[one.name]["injected"] = found
 
 
 def _beside(sets, plane, notes):

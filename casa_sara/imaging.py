@@ -2,31 +2,40 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+import casa_sara
 from casa_sara.casa import log
-from casa_sara.casa.imageplane import define_image_plane
+from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
-from casa_sara.casa.modelcolumn import write_model_column
+from casa_sara.casa.modelcolumn import save_model_column, write_model_column
 from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.products import write_products
+from casa_sara.casa.products import CHECKPOINT, write_products
 from casa_sara.casa.restore import fit_beam
+from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
+from casa_sara.deadline import Deadline
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.noise import noise_from_differences
-from casa_sara.operators.measurement import MeasurementOperator, check_cell
-from casa_sara.options import ImageGrid, Output, Selection, SolverOptions, Weighting
+from casa_sara.operators.measurement import MeasurementOperator, check_cell, check_field
+from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
 from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER
+from casa_sara.rehearsal import foresee
+from casa_sara.solver.checkpoint import Checkpoint
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
+from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
 
-__all__ = ["Result", "make_image"]
+__all__ = ["Result", "checkpoint_of", "make_image", "solve_image", "write_column"]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
 MOST_NAMED = 20  # wild samples that the log names one by one
+MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
+REPORT_SECONDS = 30.0
 IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
 
 
@@ -35,7 +44,7 @@ class Result:
     """What one run found, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
-    from the data, in units of what the weights say.
+    from the data, in units of what the weights say; `forecast` is what was said of memory and time before.
     """
 
     data: Visibilities
@@ -44,17 +53,45 @@ class Result:
     reconstruction: Reconstruction | None
     residual_peak: float
     model_flux: float
+    forecast: dict
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left for a restart to go on with."""
+        return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
+
+
+@dataclass
+class Watch:
+    """The clocks of a solution: when it has to end, and how long an iteration takes."""
+
+    deadline: Deadline
+    pace: Pace
 
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-               output: Output) -> Result:
+               output: Output, record: Callable[[Result], dict] | None = None, limits: Limits = Limits()) -> Result:
     """Image a selection of MeasurementSets and write the products.
+
+    Parameters
+    ----------
+    selection, grid, weighting, options, output
+        What the task was asked for.
+    record : callable, optional
+        Returns what is kept beside the images of the result.
 
     Raises
     ------
+    MemoryError
+        The run would not fit; nothing large was allocated.
     ValueError, FileNotFoundError, RuntimeError
         For data or parameters that no image can be made of; the message names the task parameter.
     """
+    deadline, forecast = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
+    forecast.require(limits.maxmem_gb)
+    checkpoint = checkpoint_of(selection, grid, options, output)
+    if output.resume:
+        checkpoint.open()
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
     data.notes.extend(_limits(data, grid))
@@ -63,7 +100,11 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         data.notes.append(f"phasecenter = '{grid.phasecenter}': the image is outside the primary beam, and masked everywhere")
     for note in data.notes:
         log.warn(note)
-    start = read_model(output.startmodel, plane) if output.startmodel else None
+    start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
+    if output.images_stand:
+        _save_model(selection, data, grid, options, start)
+        return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)),
+                      forecast.summary())
     # split and weigh
     block_of_sample, blocks = snapshot_blocks(data, output.blocks)
     data, offsets = sort_into_blocks(data, block_of_sample)
@@ -73,21 +114,44 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
-        density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
-        reconstruction = _solve(data, offsets, density, grid, options, noise, start)
+        deadline.reserve = _after_iterations(data, grid, output, limits, deadline.elapsed())
+        watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch)
+        forecast = replace(forecast, iteration_s=watch.pace.seconds)
         model = reconstruction.model
         data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
     weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
     residual = dirty_image(operator, data.vis - operator.forward(model), weights)
     images = dict(psf=psf, residual=residual, model=model)
-    write_products(output.imagename, plane, images, sum_of_weights(data, selection, weights), beam,
-                   output.restoringbeam, output.history)
+    result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)),
+                    forecast.summary())
+    write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result))
+    if result.finished or not checkpoint.stands:  # else one of an older run
+        checkpoint.remove()
     if output.savemodel == "modelcolumn":
-        log.info("writing the model column")
-        write_model_column(selection, data.phase_center, lambda uvw: MeasurementOperator(
-            uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads).forward(model))
-    return Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)))
+        _save_model(selection, data, grid, options, model)
+    return result
+
+
+def _save_model(selection, data, grid, options, model):
+    """Write the model's visibilities into the MeasurementSets: the last phase, the images are whole."""
+    log.info("writing the model column")
+    save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
+                      cell_rad=grid.cell_rad, nthreads=options.nthreads, model=model)
+
+
+def write_column(selection, phase_center, cell_rad, nthreads, model):
+    """Predict the visibilities of a model and write them: what `save_model_column` has a child process do."""
+    chosen = {name: tuple(value) if isinstance(value, list) else value for name, value in selection.items()}
+    write_model_column(Selection(**chosen), phase_center, lambda uvw: MeasurementOperator(
+        uvw[:2], cell_rad, model.shape, eps=IMAGE_EPS, nthreads=nthreads).forward(model))
+
+
+def _peak(name):
+    """Return the largest absolute pixel of an image that stands."""
+    with opened("image", name) as ia:
+        return float(np.abs(read_pixels(ia)).max())
 
 
 def _point_spread(data, grid, weighting, options, plane):
@@ -102,11 +166,7 @@ def _limits(data, grid):
     """What the user should know of this image plane and these baselines; raise where no image can be made of them."""
     notes = []
     check_cell(data.uvw[:2], grid.cell_rad)
-    width = min(n * cell for n, cell in zip(grid.shape, grid.cell_rad))
-    if width * data.max_uv < 1:
-        cells = [f"{np.degrees(cell) * 3600:.4g}arcsec" for cell in grid.cell_rad]
-        raise ValueError(f"imsize = {list(grid.shape)} with cell = {cells} is an image {np.degrees(width) * 3600:.3g} arcsec "
-                         f"wide: should hold the finest fringe at least, {np.degrees(1 / data.max_uv) * 3600:.3g} arcsec")
+    check_field(data.max_uv, grid.shape, grid.cell_rad)
     arcsec = np.degrees(grid.cell_rad[0]) * 3600
     pixels = 1 / (data.max_uv * max(grid.cell_rad))
     if pixels < FEWEST_PIXELS:
@@ -119,22 +179,72 @@ def _limits(data, grid):
     return notes
 
 
-def _solve(data, offsets, density, grid, options, noise, start):
-    """Reconstruct, with progress in the log and Ctrl-C as the wish to stop."""
+def _after_iterations(data, grid, output, limits, read_s):
+    """Seconds to keep for what comes after the iterations: images, model column, report."""
+    column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
+    return writing_seconds(data.size, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
+
+
+def checkpoint_of(selection, grid, options, output):
+    """Return the checkpoint of a run, which knows the parameters that decide the model, by the names of the task.
+
+    Where the data are is none of them (they are known by their contents), nor is how many threads there are.
+    """
+    startmodel = output.startmodel if output.startmodel != output.imagename + ".model" else ""  # that of restart = True
+    parameters = asdict(selection) | asdict(grid) | asdict(options) | dict(blocks=output.blocks, startmodel=startmodel)
+    parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
+    for name in ("vis", "nthreads"):
+        del parameters[name]
+    return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
+
+
+def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None):
+    """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
+
+    Parameters
+    ----------
+    data : Visibilities
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    noise : float (d,)
+        Measured in the data, in units of what the weights say; NaN where unknown.
+    selection : Selection
+        That gave the data, for their sampling density.
+    grid : ImageGrid
+    options : SolverOptions
+    start : float32 (nx, ny), optional
+        First model, Jy/pixel.
+    checkpoint : Checkpoint, optional
+        Where the state is kept now and then, or was.
+    watch : Watch, optional
+
+    Returns
+    -------
+    Reconstruction
+    """
+    density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
     progress = log.Progress()
     expected = schedule_of(options).expected_iterations
 
     def report(ppd, record):
-        fraction = min(ppd.iteration / expected, 0.999)
+        begun = record.resumed[-1] if record.resumed else 0
+        if watch and (words := watch.pace(ppd.iteration - begun)):
+            log.info(words)
+        fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
         progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
                  f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
 
-    with stop_on_interrupt() as stopped:
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped)
+    with stop_on_interrupt() as pressed:
+        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
+                                     lambda: pressed() or bool(watch and watch.deadline.near()), checkpoint)
     progress.close()
     record = reconstruction.record
+    if record.stop_code == STOPPED_BY_USER and not pressed():
+        record.stop_code = TIME_LIMIT
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
+    if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
+        log.info(f"restart = True goes on from '{checkpoint.path}'")
     released = sum(update["released"] for update in record.reweightings)
     if released:
         log.info(f"{released} pixels beside unresolved sources were allowed to be negative: the sources are between pixels")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
-__all__ = ["Comparing", "ImageGrid", "Output", "Selection", "SolverOptions", "Weighting"]
+__all__ = ["Comparing", "ImageGrid", "Limits", "Output", "Selection", "SolverOptions", "Weighting"]
 
 SARA_BASES = ("dirac", "db1", "db2", "db3", "db4", "db5", "db6", "db7", "db8")
 
@@ -91,7 +92,9 @@ class SolverOptions:
 class Output:
     """Where results go, and what goes along.
 
-    `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image.
+    `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image;
+    `resume` says to go on from the checkpoint. With `images_stand` the products of an earlier run stay as they are, and
+    only the model column is written.
     """
 
     imagename: str
@@ -99,7 +102,22 @@ class Output:
     blocks: int = 0
     restoringbeam: tuple[str, ...] | None = ()
     savemodel: str = "none"
+    images_stand: bool = False
     history: tuple[str, ...] = ()
+    resume: bool = False
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the run may take; `report` tells whether a report is made after it, which takes its share.
+
+    `maxmem_gb` is the most that the process may hold, in 1e9 bytes, 0 for what the machine has; `maxtime_s` is infinite
+    where there is no limit.
+    """
+
+    maxmem_gb: float = 0.0
+    maxtime_s: float = math.inf
+    report: bool = False
 
 
 @dataclass(frozen=True)
@@ -113,4 +131,7 @@ class Comparing:
     support: str = ""
     threshold: float = 1e-3
     robust: float = -1.0
+    frames: tuple[str, ...] = ()
+    inject: tuple[str, ...] = ()
+    injectflux: float = 0.0
     nthreads: int = 1

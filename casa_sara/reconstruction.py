@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from casa_sara.operators.dictionary import SaraDictionary
-from casa_sara.operators.measurement import MeasurementOperator
-from casa_sara.operators.norms import power_method
-from casa_sara.outliers import find_wild
+from casa_sara.problem import Findings, Problem, Samples, first_image
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
-from casa_sara.solver.nnls import nnls
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
-from casa_sara.solver.reweighting import Schedule, solve
+from casa_sara.solver.reweighting import Schedule, Stage, solve
 
 __all__ = ["Reconstruction", "reconstruct", "schedule_of"]
 
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
-ROUNDS = 6  # of leaving out wild samples
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
 
@@ -63,7 +60,7 @@ class Reconstruction:
 
 
 def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=None,
-                progress=lambda ppd, record: None, stopped=lambda: False):
+                progress=lambda ppd, record: None, stopped=lambda: False, checkpoint=None):
     """Find the SARA image of block-sorted visibilities.
 
     Parameters
@@ -81,95 +78,109 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     startmodel : real (nx, ny), optional
         First image, Jy/pixel.
     progress, stopped : callable
-        See :func:`casa_sara.solver.reweighting.solve`.
+        See :func:`casa_sara.solver.reweighting.solve`; `stopped` ends the NNLS fit too, and one iteration follows.
+    checkpoint : Checkpoint, optional
+        Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
+        whose NNLS fit was cut short is not kept: it is not on the way to the same image.
 
     Returns
     -------
     Reconstruction
+
+    Raises
+    ------
+    CheckpointError
+        The state that was read is not one of these data.
     """
     if options.databound == "fixed" and len(options.l2bound) not in (1, len(offsets) - 1):
         raise ValueError(f"l2bound = {list(options.l2bound)}: there are {len(offsets) - 1} blocks; give one noise level "
                          "for all of them, or one for each")
+    samples = Samples(data, np.asarray(offsets), density, np.arange(data.size))
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(np.mean(data.weight, dtype=float) ** -0.5)
-    kept, wild = np.arange(data.size), []
-    for _ in range(ROUNDS):
-        problem = _Problem.of(data, density, grid, options, unit_jy)
-        # positivity and a vanishing sparsity alone: where the bounds start, and the model too
-        first, residual = nnls(problem.measurement, problem.vis, problem.precond, problem.data_norm_sq,
-                               positivity=options.positivity)
-        found = find_wild(data, offsets, residual, unit_jy * float(np.abs(first).sum(dtype=float)))
-        if found.index.size == 0:
-            break
-        wild += found.named(data)
-        good = np.delete(np.arange(data.size), found.index)
-        offsets = np.searchsorted(good, offsets)
-        data, density, kept = data.take(good), density[good], kept[good]
-    if found.index.size:
-        problem = _Problem.of(data, density, grid, options, unit_jy)
-        residual = np.delete(residual, found.index)
+    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy)
+    if checkpoint is not None:
+        checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, blocks=samples.offsets,
+                            density=density, noise=noise)
+    if checkpoint is not None and checkpoint.state is not None:
+        solution = _resume(samples, problem_of, options, noise, checkpoint)
+    else:
+        solution = _begin(samples, problem_of, options, noise, startmodel, stopped)
+        if stopped():
+            checkpoint = None
 
-    data_norm_sq = problem.data_norm_sq
-    dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
-    ppd = AdaptivePPD(problem.measurement, dictionary, problem.vis, offsets, problem.precond, data_norm_sq,
-                      options.positivity)
-    ppd.unit_jy = unit_jy
-    weights = data.weight * np.float32(unit_jy**2)
-    nnls_norms = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
-    bounds = _bounds(ppd, nnls_norms, weights, noise, options)
-    noise_only = _is_noise_only(ppd, bounds)
-    if startmodel is not None:
-        first = startmodel / np.float32(unit_jy)
-    ppd.start_from(first)
-    ppd.rescale(STEP_BALANCE * _mean_brightness(first))
+    def keep(stage, now):
+        if checkpoint is not None:
+            checkpoint.keep(lambda: solution.state(stage), solution.ppd.iteration, now)
 
+    found, ppd, bounds = solution.found, solution.ppd, solution.bounds
     schedule = schedule_of(options)
-    if noise_only:
+    if found.noise_only:
         schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
-    record = solve(ppd, bounds, schedule, progress, stopped)
-    if record.stop_code == CONVERGED and noise_only:
+    record = solve(ppd, bounds, schedule, progress, stopped, keep, solution.stage)
+    if record.stop_code == CONVERGED and found.noise_only:
         record.stop_code = NOISE_ONLY
     ppd.model *= np.float32(unit_jy)
     noise_jy_per_beam = unit_jy * bounds.total_weight**-0.5
-    return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms, nnls_norms, record,
-                          data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam, kept, wild)
+    return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
+                          found.data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam,
+                          np.delete(samples.kept, found.left_out), found.wild)
 
 
 @dataclass
-class _Problem:
-    """Whitened samples y = √w·V, and the operators that belong to them."""
+class _Solution:
+    """The iteration of a problem with its bounds, begun or gone on with."""
 
-    vis: np.ndarray
-    measurement: MeasurementOperator
-    precond: np.ndarray
-    data_norm_sq: float
+    found: Findings
+    ppd: AdaptivePPD
+    bounds: AdaptiveBounds | GivenBounds
+    stage: Stage | None = None
 
     @classmethod
-    def of(cls, data, density, grid, options, unit_jy):
-        """Whiten the data and build their operator for images in `unit_jy`."""
-        sqrt_weight = np.sqrt(data.weight)
-        vis = data.vis * sqrt_weight
-        sqrt_weight *= np.float32(unit_jy)
-        measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight,
-                                          nthreads=options.nthreads)
-        precond = _preconditioner(density, options.precondition)
-        data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),
-                                    grid.shape, dtype=np.float32)
-        return cls(vis, measurement, precond, data_norm_sq)
+    def of(cls, problem, found, options, noise):
+        """Put it together, at the very beginning."""
+        measurement, unit_jy = problem.measurement, problem.unit_jy
+        dictionary = SaraDictionary(measurement.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
+        ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.samples.offsets, problem.precond,
+                          found.data_norm_sq, options.positivity)
+        ppd.unit_jy = unit_jy
+        weights = problem.samples.data.weight * np.float32(unit_jy**2)
+        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, noise, options))
+
+    def state(self, stage):
+        """Return all that :func:`_resume` needs beside the data and the parameters."""
+        return dict(found=vars(self.found), ppd=self.ppd.state(), bounds=self.bounds.state(), stage=stage.state())
+
+
+def _begin(samples, problem_of, options, noise, startmodel, stopped):
+    """Leave out wild samples, and begin from the first image or from `startmodel`."""
+    problem, found, first = first_image(samples, problem_of, options, stopped)
+    solution = _Solution.of(problem, found, options, noise)
+    found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
+    if startmodel is not None:
+        first = startmodel / np.float32(problem.unit_jy)
+    solution.ppd.start_from(first)
+    solution.ppd.rescale(STEP_BALANCE * _mean_brightness(first))
+    return solution
+
+
+def _resume(samples, problem_of, options, noise, checkpoint):
+    """Go on from the state that was read."""
+    with checkpoint.applied() as state:
+        found = Findings(**{name: np.array(value) if isinstance(value, np.ndarray) else value
+                            for name, value in state["found"].items()})
+        problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq)
+        solution = _Solution.of(problem, found, options, noise)
+        solution.ppd.set_state(state["ppd"])
+        solution.bounds.set_state(state["bounds"])
+        solution.stage = Stage.of(state["stage"])
+    return solution
 
 
 def schedule_of(options):
     """The solver's schedule for these task parameters."""
     return Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,
                     options.reltol, options.finalreltol)
-
-
-def _preconditioner(density, wanted):
-    """U = 1/density, largest value 1."""
-    if not wanted:
-        return np.ones(density.size, np.float32)
-    precond = 1.0 / np.asarray(density, float)
-    return (precond / precond.max()).astype(np.float32)
 
 
 def _bounds(ppd, nnls_norms, weights, noise, options):
@@ -192,7 +203,7 @@ def _bounds(ppd, nnls_norms, weights, noise, options):
 
 def _is_noise_only(ppd, bounds):
     """Whether the naturally weighted dirty image holds no peak above 5 times its noise."""
-    whitening = np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(np.float32)
+    whitening = np.repeat(bounds.noise_weights.astype(np.float32), np.diff(ppd.offsets))
     dirty = ppd.measurement.adjoint(ppd.vis * whitening)
     return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(bounds.total_weight))
 

@@ -90,14 +90,19 @@ def measures(products, sky, regions):
             }  # fmt: skip
         if sky is not None:
             entry["truth"] = {"snr": metrics.snr(sky, made.model), "log_snr": metrics.log_snr(sky, made.model),
-                              "ssim": 0.97, "snr_at_scale": {"0.4": 30.0, "1.0": 40.0}}
+                              "ssim": 0.97, "ssim_range_jy_per_pixel": float(sky.max()),
+                              "snr_at_scale": {"0.4": 30.0, "1.0": 40.0}}
         found[made.name] = entry
+    found[products[0].name]["injected"] = {"19h59m28.3s +40d44m12s": {
+        "injected_jy": 0.02, "flux_jy": 0.019, "offset_arcsec": 0.02, "fwhm_arcsec": 0.25,
+        "fwhm_in_beams": {name: 0.25 / np.sqrt(beam[0] * beam[1]) for name, beam in BEAMS.items()},
+    }}  # fmt: skip
     pairs = {f"{a.name}|{b.name}": metrics.snr(a.model, b.model)
              for number, a in enumerate(products) for b in products[number + 1 :]}
     return {"products": found, "similarity": {weighting: dict(pairs) for weighting in WEIGHTINGS}}
 
 
-def comparison(names=("tsara", "tclean briggs", "tclean natural"), with_truth=True, with_regions=True):
+def comparison(names=("tsara", "tclean briggs", "tclean natural"), with_truth=True, with_regions=True, frames=()):
     """Return a comparison with everything in it."""
     parameters = {"vis": "['A.ms', 'D.ms']", "imsize": "[96, 64]", "cell": "0.1arcsec"}
     products = tuple(
@@ -113,4 +118,4 @@ def comparison(names=("tsara", "tclean briggs", "tclean natural"), with_truth=Tr
     sky = truth() if with_truth else None
     return Comparison(products, (CELL, CELL), (299.868, 40.734), dict(BEAMS), sky, truth() > 0, masks,
                       measures(products, sky, masks), {"casa_sara": "1.2.3", "numpy": "2.0"},
-                      ("one sample was wild & left out",))
+                      ("one sample was wild & left out",), frames)

@@ -24,7 +24,7 @@ from casa_sara.casa.products import (
     write_products,
 )
 from casa_sara.casa.restore import fit_beam, restore, restoring_beam_words
-from casa_sara.options import ImageGrid, Selection
+from casa_sara.options import ImageGrid, Output, Selection
 
 ARCSEC = np.pi / 180 / 3600
 OFF_CENTRE = "J2000 19h59m40.5s +40d40m02s"
@@ -210,7 +210,8 @@ def test_products_and_restored_image_are_tcleans(name, runs, tmp_path, case, res
     reference = {product: contents(theirs + product) for product in PRODUCTS}
     images = {kind: reference["." + kind]["pixels"] for kind in ("psf", "residual", "model")}
     sumwt = reference[".sumwt"]["pixels"].item()
-    write_products(ours, run.plane, images, sumwt, reference[".psf"]["beam"], restoringbeam, ["a line"])
+    output = Output(ours, restoringbeam=restoringbeam, history=("a line",))
+    write_products(output, run.plane, images, sumwt, reference[".psf"]["beam"])
     assert existing_products(ours) == [ours + product for product in PRODUCTS]
     for product in PRODUCTS:
         made = contents(ours + product)
@@ -297,7 +298,7 @@ def test_imagename_that_cannot_be_written_is_refused(tmp_path, monkeypatch):
         check_imagename("folder/", (8, 8))
     with pytest.raises(FileNotFoundError, match="the folder 'absent' does not exist"):
         check_imagename("absent/run", (8, 8))
-    with pytest.raises(OSError, match=r"imagename = 'run', imsize = .*: the images take \d+ MB, '\.' has"):
+    with pytest.raises(OSError, match=r"imagename = 'run', imsize = .*: the images take [\d.]+ MB, '\.' has"):
         check_imagename("run", (10**7, 10**7))
     monkeypatch.setattr(os, "access", lambda *_: False)
     with pytest.raises(PermissionError, match="cannot be written to"):
@@ -409,7 +410,7 @@ def test_tclean_goes_on_from_our_products(name, runs, tmp_path):
     images = {kind: contents(f"{run.root}.{kind}")["pixels"] for kind in ("psf", "residual", "model")}
     root = str(tmp_path / "on")
     sumwt, beam = contents(run.root + ".sumwt")["pixels"].item(), contents(run.root + ".psf")["beam"]
-    write_products(root, run.plane, images, sumwt, beam, "")
+    write_products(Output(root, restoringbeam=""), run.plane, images, sumwt, beam)
     record = casatasks.tclean(
         vis=name, imagename=root, imsize=list(run.plane.shape), cell="3.0arcsec", niter=20, datacolumn="data",
         calcpsf=False, calcres=False,

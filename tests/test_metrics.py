@@ -7,6 +7,7 @@ from astropy.convolution import convolve_fft
 from radio_beam import Beam
 
 from casa_sara.analysis import metrics
+from casa_sara.analysis.points import recovered_point
 from casa_sara.analysis.areas import Frame, region_masks
 from casa_sara.analysis.comparison import Product
 from casa_sara.analysis.measuring import measure, source_support
@@ -18,6 +19,7 @@ def test_snr_by_hand():
     assert metrics.snr([3.0, 4.0], [3.0, 4.5]) == pytest.approx(20.0)  # 5 against 0.5
     assert metrics.snr([[1.0, 0.0]], [[0.0, 0.0]]) == 0.0
     assert metrics.snr([1.0, 2.0], [1.0, 2.0]) == np.inf
+    assert np.isnan(metrics.snr([1.0, 2.0], [1.0, np.nan]))  # not a perfect model
 
 
 def test_log_snr_by_hand():
@@ -305,3 +307,45 @@ def test_compare_draws_a_picture(tmp_path):
     columns = [Column("truth", sky, sky, None, beam, "truth", "a note"), Column("image", sky, sky + noise, noise, beam)]
     compare(tmp_path / "picture.png", columns, 0.5, [Zoom("centre", 0, 0, 6.0)], title="test")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+# Points -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("cell", [(1.0, 1.0), (0.5, 1.0)])
+def test_a_gaussian_is_recovered_with_its_flux_place_and_width(cell):
+    x, y = np.indices((90, 80))
+    fwhm, place = 6.0, (40.3, 37.8)
+    away = np.hypot((x - place[0]) * cell[0], (y - place[1]) * cell[1])
+    image = np.exp(-4 * np.log(2) * (away / fwhm) ** 2)
+    image /= image.sum()
+    found = recovered_point(image, place, 15.0, cell)
+    assert found["flux"] == pytest.approx(1, rel=1e-4)
+    assert found["offset"] == pytest.approx(0, abs=1e-3)
+    assert found["width"] == pytest.approx(fwhm, rel=2e-2)
+    narrow = recovered_point(image, place, fwhm, cell)["flux"]
+    assert narrow == pytest.approx(1 - 1 / 16, rel=1e-2)  # beyond one width, of a Gaussian
+    beside = recovered_point(image, (place[0] + 1, place[1]), 15.0, cell)
+    assert beside["offset"] == pytest.approx(cell[0], rel=1e-3)
+    assert beside["width"] == pytest.approx(found["width"], rel=1e-2)
+
+
+def test_one_pixel_is_as_wide_as_the_circle_of_half_its_area():
+    image = np.zeros((21, 21))
+    image[9, 12] = 2.0
+    found = recovered_point(image, (9, 12), 4.0, (0.5, 0.5))
+    assert found == {"flux": pytest.approx(2.0), "offset": pytest.approx(0, abs=1e-12),
+                     "width": pytest.approx(0.5 * 2 * np.sqrt(0.5 / np.pi), rel=2e-2)}
+    image[9, 12] = -2.0
+    assert recovered_point(image, (9, 12), 4.0) == {"flux": pytest.approx(-2.0)}
+    with pytest.raises(ValueError, match="a circle of 4 around it is not within"):
+        recovered_point(image, (9, 18), 4.0)
+
+
+def test_a_width_does_not_grow_with_what_noise_leaves_around():
+    """An even sprinkling of a tenth of the flux: second moments would more than double."""
+    rng = np.random.default_rng(3)
+    image = np.exp(-4 * np.log(2) * ((np.indices((41, 41)) - 20) ** 2).sum(axis=0) / 3.0**2)
+    alone = recovered_point(image, (20, 20), 15.0)["width"]
+    image += rng.standard_normal(image.shape) * 0.1 * image.sum() / 700
+    assert recovered_point(image, (20, 20), 15.0)["width"] == pytest.approx(alone, rel=0.1)

@@ -27,30 +27,41 @@ ROOMS = {
     "tasks": {"casa_sara.private"},
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
     "private": {
-        "casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.resources", "casa_sara.solver",
+        "casa_sara", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal", "casa_sara.resources",
+        "casa_sara.solver",
         "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
     },
     "interrupt": set(),
+    "deadline": set(),
+    "problem": {"casa_sara.operators", "casa_sara.outliers", "casa_sara.solver", "casa_sara.visibilities", "numpy"},
     "resources": set(),
     "options": set(),
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
     "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
-    "casa": {"casa_sara", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
+    "casa": {"casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
     "operators": {
         "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
     },
     "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
-    "analysis": {"numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
+    "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
     "jsonfile": set(),
 }
-LIBRARY = ("options", "visibilities", "noise", "outliers", "operators", "solver", "analysis")
+LIBRARY = ("options", "visibilities", "noise", "outliers", "problem", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["imaging"] = {"casa_sara.casa", "casa_sara.interrupt", "numpy", *NUMERICS}
-ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.jsonfile", "numpy", *NUMERICS}
+ROOMS["forecast"] = {"casa_sara.operators"}
+ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
+ROOMS["rehearsal"] = {"casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", *NUMERICS}
+ROOMS["imaging"] = {
+    "casa_sara", "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.interrupt", "casa_sara.rehearsal",
+    "casa_sara.timing", "numpy", *NUMERICS,
+}
+ROOMS["injection"] = {"casa_sara.casa", "casa_sara.imaging", "numpy", *NUMERICS}
+ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "numpy", *NUMERICS}
 ROOMS["demo"] = {
-    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "numpy", "finufft", "matplotlib", *NUMERICS,
+    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "casa_sara.resources", "numpy", "finufft",
+    "matplotlib", *NUMERICS,
     *CASA,
 }
 

@@ -13,14 +13,15 @@ from PIL import Image
 from synthetic_comparison import BEAMS, CELL, SHAPE, comparison, measures, record
 
 from casa_sara.analysis import animation, convergence, diagnostics, pages, zooms
+from casa_sara.analysis.columns import number
 from casa_sara.analysis.comparison import Product
 from casa_sara.analysis.report import write_report
 from casa_sara.analysis.sheets import celestial, draw_beam, plain
-from casa_sara.analysis.tables import as_text, number, tables
+from casa_sara.analysis.tables import as_text, tables
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "chromium-browser"))), None)
 EVIL = '<script>alert("1")</script>$x_$ & co'
-FRAMES = [("coarse", np.ones((8, 6)), 0.4), ("fine", np.eye(16, 12) + 1, 0.2)]
+FRAMES = (("coarse", np.ones((24, 16)), 0.4), ("fine", np.eye(48, 32) + 1, 0.2))
 
 
 class Page(html.parser.HTMLParser):
@@ -48,13 +49,12 @@ class Page(html.parser.HTMLParser):
 
 @pytest.fixture(scope="module")
 def full():
-    return comparison()
+    return comparison(frames=FRAMES)
 
 
 @pytest.fixture(scope="module")
 def report(full, tmp_path_factory):
-    return write_report(full, tmp_path_factory.mktemp("report"), title="A test", frames=FRAMES,
-                        zoom=(0.0, 0.0, 2.0))
+    return write_report(full, tmp_path_factory.mktemp("report"), title="A test")
 
 
 def pixels(path):
@@ -63,19 +63,57 @@ def pixels(path):
 
 def test_report_has_every_section_and_picture(report):
     page = Page(report)
-    assert page.ids == ["warnings", "measures", "sky", "residuals", "runs", "notes", "parameters", "versions"]
-    expected = ["Models", "Residual and restored images, natural weighting",
+    assert page.ids == ["warnings", "measures", "sky", "frames", "residuals", "runs", "notes", "parameters", "versions"]
+    expected = ["Models", "Residual and restored images, natural weighting", "χ² of the blocks",
                 "Regions, flux of the models", "Regions, flux of the restored images", "Against the truth",
-                "Similarity", "All products, natural weighting", "All products, briggs weighting", "Models, enlarged",
-                "Differences", "From coarse to fine pixels", "Radial power spectra", "Histograms of the residuals",
+                "Injected point sources: resolution reached", "Similarity", "All products, natural weighting",
+                "All products, briggs weighting", "Models, enlarged",
+                "Differences", "Pixel by pixel: the field", "Pixel by pixel: core",
+                "Pixel by pixel: lobe", "Radial power spectra", "Histograms of the residuals",
                 "Convergence of tsara", "Calibration of tsara, block by block"]  # fmt: skip
     assert set(expected) <= set(page.titles)
     drawn = {path.name for path in report.parent.glob("*.png")}
-    assert drawn == {"sky_natural.png", "sky_briggs.png", "zooms.png", "differences.png", "cells.png", "spectra.png",
-                     "histograms.png", "convergence_1.png", "blocks_1.png"}  # fmt: skip
+    assert drawn == {"sky_natural.png", "sky_briggs.png", "zooms.png", "differences.png", "cells.png", "cells_1.png",
+                     "cells_2.png", "spectra.png", "histograms.png", "convergence_1.png", "blocks_1.png"}  # fmt: skip
     assert page.tags.count("img") == len(drawn)
     for word in ("imsize", "1.2.3", "one sample was wild & left out", "0.1160 ± 0.0013", "weighting"):
         assert word in page.text
+
+
+def test_a_report_replaces_the_earlier_one_whole(tmp_path, monkeypatch):
+    """Pictures of the earlier report go, other files stay, and a report that fails changes nothing."""
+    few = comparison(names=("one",), with_truth=False)
+    write_report(comparison(frames=FRAMES), tmp_path)
+    (tmp_path / "mine.png").write_text("mine")
+    (tmp_path / "differences.txt").write_text("mine")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.setattr(diagnostics, "histograms", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_report(few, tmp_path)
+    with pytest.raises(ZeroDivisionError):
+        write_report(few, tmp_path / "new")
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    monkeypatch.undo()
+    write_report(few, tmp_path)
+    after = {path.name for path in tmp_path.iterdir()}
+    gone = {"cells.png", "cells_1.png", "cells_2.png", "differences.png"}
+    assert gone < before.keys() and after == before.keys() - gone
+    assert (tmp_path / "mine.png").read_text() == (tmp_path / "differences.txt").read_text() == "mine"
+    assert "tclean natural" not in (tmp_path / "report.html").read_text()
+
+
+def test_a_file_that_is_not_the_reports_is_not_replaced(tmp_path):
+    few = comparison(names=("one",), with_truth=False)
+    (tmp_path / "zooms.png").write_text("mine")
+    with pytest.raises(FileExistsError, match="holds zooms.png, not of an earlier report"):
+        write_report(few, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["zooms.png"]
+    folder, outside = tmp_path / "folder", tmp_path / "outside.txt"
+    folder.mkdir()
+    outside.write_text("mine")
+    (folder / "report.files").write_text("../outside.txt\n..\nreport.files\n")
+    write_report(few, folder)
+    assert outside.read_text() == "mine" and (folder / "report.html").exists()
 
 
 def test_report_is_self_contained(report):
@@ -218,6 +256,15 @@ def test_zooms_are_around_regions_or_peaks(full):
         assert any(z.box[0] <= x < z.box[1] and z.box[2] <= y < z.box[3] for z in peaks)
 
 
+def test_a_zoom_is_where_its_region_is(full):
+    """The box around the core is centred, in arcsec to the east and north, on the middle of its mask."""
+    core = zooms.find_zooms(full)[0]
+    east, north, side = core.on_sky(full)
+    x, y = np.argwhere(full.regions["core"]).mean(axis=0)
+    assert (east, north) == pytest.approx(((SHAPE[0] // 2 - x) * CELL, (y - SHAPE[1] // 2) * CELL), abs=CELL)
+    assert side == pytest.approx(1.3 * 15 * CELL, abs=CELL)
+
+
 def test_spectrum_of_white_noise_and_of_a_point():
     noise = np.random.default_rng(1).standard_normal((128, 96)) * 3
     for window in (False, True):
@@ -257,6 +304,12 @@ def test_animation_has_a_frame_for_each_image(tmp_path):
         assert np.any(np.asarray(image.convert("RGB"), float) != first)
     with pytest.raises(ValueError, match="zoom=.* holds no emission"):
         animation.animate(path, FRAMES, zoom=(50.0, 0.0, 1.0))
+    square = first.shape
+    animation.animate(path, FRAMES)  # the field of 48 x 32 pixels
+    with Image.open(path) as image:
+        assert image.width > 1.1 * square[1] and image.height < 0.9 * square[0]
+    one = [*FRAMES, ("dark", np.zeros((8, 8)), 0.4)]
+    assert animation.has_emission(FRAMES, (0.0, 0.0, 1.0)) and not animation.has_emission(one, (0.0, 0.0, 1.0))
     with pytest.raises(ValueError, match="frames is empty"):
         animation.animate(path, [])
 
@@ -264,7 +317,7 @@ def test_animation_has_a_frame_for_each_image(tmp_path):
 def test_table_as_text(full):
     text = as_text(full)
     titles = [table.title for table in tables(full)]
-    assert len(titles) == 7 and all(title in text for title in titles)
+    assert len(titles) == 9 and all(title in text for title in titles)
     assert "note: one sample was wild & left out" in text
     flux = full.measures["products"]["tsara"]["flux_jy"]
     assert re.search(rf"^ +flux .*\n +Jy .*\n  tsara +{flux:.4f} ", text, re.MULTILINE)
@@ -303,6 +356,29 @@ def test_names_are_printed_as_they_are():
     assert plain("_a $b$") == r" _a \$b\$" and plain("a_b") == "a_b"
 
 
+def test_chi_square_of_the_blocks_and_the_range_of_ssim(full):
+    made = {table.title: table for table in tables(full)}
+    blocks, against = made["χ² of the blocks"], made["Against the truth"]
+    assert blocks.heads == ("", "median", "least", "most", "blocks")
+    assert blocks.rows[0] == ("tsara", "1.100", "1.000", "1.400", "3")
+    number_of = against.heads.index("SSIM")
+    assert against.heads[number_of + 1] == "its range" and against.units[number_of + 1] == "mJy/pixel"
+    assert float(against.rows[0][number_of + 1]) == pytest.approx(1e3 * full.truth.max(), rel=1e-3)
+
+
+def test_injected_sources_beside_the_beams(full):
+    """Widths in arcsec and in beams; a restored image is as wide as its own beam."""
+    made = {table.title: table for table in tables(full)}["Injected point sources: resolution reached"]
+    assert made.heads == ("", "injected", "recovered", "recovered", "offset", "width", "width", "width")
+    assert made.units == ("", "mJy", "mJy", "%", "arcsec", "arcsec", "natural beams", "briggs beams")
+    assert made.rows == (
+        ("tsara, 19h59m28.3s +40d44m12s", "20.00", "19.00", "95.00", "0.02000", "0.2500", "0.315", "0.559"),
+        ("restored images, natural weighting", "–", "–", "–", "–", "0.7937", "1.000", "1.775"),
+        ("restored images, briggs weighting", "–", "–", "–", "–", "0.4472", "0.563", "1.000"),
+    )
+    assert "in a circle of 0.447″" in made.caption and "other imagers were not run again" in made.caption
+
+
 def test_what_was_not_measured_is_left_out(full):
     measured = {"products": {"tsara": {"flux_jy": 1.0}, "tclean briggs": {"flux_jy": 2.0, "mdr": float("inf")}},
                 "similarity": {"natural": {"tsara|tclean briggs": float("inf")}}}
@@ -316,16 +392,19 @@ def test_what_was_not_measured_is_left_out(full):
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium to render the page")
 @pytest.mark.parametrize("width", [1024, 1400])
 def test_page_fits_the_window(report, width, tmp_path):
-    """The page is no wider than the window: asked of the layout, and seen at the right edge of a screenshot."""
+    """The page is no wider than the window, nor a table than the page: asked of the layout, and seen."""
     probe = tmp_path / "probe.html"
-    script = "<script>document.title = document.documentElement.scrollWidth + ' ' + innerWidth</script></body>"
+    script = """<script>document.title = [document.documentElement.scrollWidth, innerWidth,
+        ...[...document.querySelectorAll(".wide")].map(box => box.scrollWidth - box.clientWidth)].join(" ")
+        </script></body>"""
     probe.write_text(report.read_text(encoding="utf-8").replace("</body>", script), encoding="utf-8")
     picture = tmp_path / "page.png"
     browser = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars",
                f"--user-data-dir={tmp_path / 'profile'}", f"--window-size={width},3000"]
     dom = subprocess.run([*browser, "--dump-dom", probe.as_uri()], capture_output=True, text=True, timeout=120)
-    title = re.search(r"<title>(\d+) (\d+)</title>", dom.stdout)
-    assert title and title[1] == title[2] == str(width)
+    page_width, window, *beyond = map(int, re.search(r"<title>([\d ]+)</title>", dom.stdout)[1].split())
+    assert page_width == window == width
+    assert len(beyond) == 11 and not any(beyond)  # nine tables of measures, parameters and versions
     subprocess.run([*browser, f"--screenshot={picture}", report.as_uri()], capture_output=True, check=True, timeout=120)
     page = pixels(picture)
     assert page.shape == (3000, width, 3)

@@ -1,7 +1,9 @@
 """The comparison as a user calls it: products in, measures out, and every refusal."""
 
+import dataclasses
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,19 +14,22 @@ import numpy as np
 import pytest
 from astropy import units
 from astropy.convolution import convolve_fft
+from PIL import Image
 from radio_beam import Beam
-from simulated_ms import simulate
+from simulated_ms import edit, simulate
 from test_shell import SCRIPT
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import jsonfile, saracompare
+from casa_sara import injection, jsonfile, saracompare, tsara
 from casa_sara.analysis import metrics
+from casa_sara.casa.imagesets import read_image_set
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.skyimage import read_header, read_sky_image
 from casa_sara.casa.weights import imaging_weights
 from casa_sara.compare import compare_images
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
+from casa_sara.solver.record import STOPPED_BY_USER
 from casa_sara.tasks import saracompare as compare_task
 from casa_sara.tasks import tsara as tsara_task
 
@@ -43,7 +48,8 @@ def write(name, pixels, unit="Jy/pixel", cell=0.5, centre=CENTRE, beam=None, fra
     csys.setunits(["rad", "rad", "", "Hz"])
     csys.setreferencevalue(list(centre), "direction")
     csys.setreferencepixel([n // 2 for n in pixels.shape], "direction")
-    csys.setincrement([-cell * ARCSEC, cell * ARCSEC], "direction")
+    wide, high = np.broadcast_to(cell, 2) * ARCSEC
+    csys.setincrement([-float(wide), float(high)], "direction")
     csys.setreferencevalue(8.4e9, "spectral")
     ia = casatools.image()
     pixels = np.asarray(pixels, np.float32)[:, :, None, None]
@@ -249,7 +255,27 @@ def test_truth_is_brought_to_the_same_pixels(tmp_path):
     found = saracompare(models=[one, one], truth=truth)["products"]["one"]
     by_hand = 20 * np.log10(np.linalg.norm(sky()) / np.linalg.norm(model - sky()))
     assert found["truth"]["snr"] == pytest.approx(by_hand, abs=0.1)
-    assert set(found["truth"]) == {"snr", "log_snr", "ssim", "snr_at_scale"}
+    assert set(found["truth"]) == {"snr", "log_snr", "ssim", "ssim_range_jy_per_pixel", "snr_at_scale"}
+    peak = found["truth"]["ssim_range_jy_per_pixel"]
+    assert peak == pytest.approx(1.0, rel=1e-3)  # of the truth
+    assert found["truth"]["ssim"] == pytest.approx(metrics.ssim(sky(), model, peak), rel=1e-3)
+
+
+def test_frames_are_animated_in_the_report(tmp_path):
+    """The field, and the region that holds emission; each with a frame for each image, in their order."""
+    one, *_ = product(tmp_path / "one")
+    fine = write(tmp_path / "fine.model", sky((256, 256), scale=2), cell=0.25)
+    regions = ["patch = 19h59m28.5s +40d44m02s 3.3arcsec", "empty = 19h59m28.5s +40d44m20s 2arcsec"]
+    saracompare(models=[one, one], outdir="report", frames=[one, fine], regions=regions)
+    drawn = sorted(path.name for path in Path("report").glob("cells*.png"))
+    assert drawn == ["cells.png", "cells_1.png"]
+    page = Path("report/report.html").read_text()
+    assert page.count("Pixel by pixel: ") == 2 * len(drawn) and 'id="frames"' in page
+    with Image.open("report/cells.png") as image:
+        assert image.n_frames == 2
+    comparison = compare_images(Comparing((one, one), frames=(fine, one)))
+    assert [(name, pixels.shape, round(cell, 9)) for name, pixels, cell in comparison.frames] \
+        == [("fine", (256, 256), 0.25), ("one", (128, 128), 0.5)]
 
 
 # Visibilities -----------------------------------------------------------------------------------
@@ -344,6 +370,82 @@ def test_visibilities_are_selected_and_untouched(tmp_path, vis):
     assert before == {path: path.read_bytes() for path in Path(vis).rglob("*") if path.is_file()}
 
 
+# Injection --------------------------------------------------------------------------------------
+
+EMPTY = "19h59m27.35632s +40d43m49.99965s"  # pixel (90, 40) of 128
+
+
+@pytest.fixture(scope="module")
+def deep(tmp_path_factory):
+    """A MeasurementSet with little noise and an image of tsara of it, made with parameters of its own."""
+    folder = tmp_path_factory.mktemp("deep")
+    components = [(flux, -west * 0.5 * ARCSEC, north * 0.5 * ARCSEC) for flux, west, north in SOURCES]
+    name = simulate(folder / "c.ms", configuration="c", antennas=14, sky=components, noise=0.01, scans=2,
+                    integration=30.0, spacing_seconds=5400.0, hour_angle=-2.5, seed=6)
+    root = str(folder / "sara")
+    tsara(vis=name, imagename=root, imsize=128, cell="0.5arcsec", datacolumn="data", blocks=3, wavelevels=3,
+          wavelets=["dirac", "db1", "db4"], nreweights=12)
+    return name, root
+
+
+def test_an_injected_source_is_recovered(tmp_path, deep):
+    """A point of known flux on a pixel of the empty sky, narrower than the beam; CLEAN's is not asked again."""
+    vis, root = deep
+    before = {path: path.read_bytes() for path in Path(vis).rglob("*") if path.is_file()}
+    one, *_ = product(tmp_path / "one")
+    models = [one, root]
+    found = saracompare(models=models, vis=vis, datacolumn="data", inject=EMPTY, injectflux=0.3, outdir="report")
+    assert "injected" not in found["products"]["one"]
+    (source,) = found["products"]["sara"]["injected"].values()
+    assert source["injected_jy"] == 0.3
+    assert source["flux_jy"] == pytest.approx(0.3, rel=0.04)
+    assert source["offset_arcsec"] < 0.1
+    assert 0.35 < source["fwhm_arcsec"] < 0.9  # pixels are 0.5 arcsec wide
+    beam = compare_images(Comparing((root,)), single=True).beams["natural"]  # of the PSF
+    in_beams = source["fwhm_arcsec"] / np.sqrt(beam[0] * beam[1])
+    assert source["fwhm_in_beams"]["natural"] == pytest.approx(in_beams, rel=0.01)
+    assert source["fwhm_in_beams"]["natural"] < 0.35
+    assert f"sara, {EMPTY}" in Path("report/report.html").read_text()
+    assert before == {path: path.read_bytes() for path in Path(vis).rglob("*") if path.is_file()}
+
+
+def test_a_source_between_pixels_of_a_model_elsewhere(tmp_path, deep):
+    """The first model has other pixels and another centre: places are on the sky; the flux is of the noise."""
+    vis, root = deep
+    centre = CENTRE[0] - 6 * 0.5 * ARCSEC / np.cos(CENTRE[1]), CENTRE[1] - 4 * 0.5 * ARCSEC
+    two = write(tmp_path / "two.model", np.roll(sky(), (-6, 4), axis=(0, 1)), centre=centre)
+    place = "19h59m27.33432s +40d43m50.14963s"
+    found = saracompare(models=[two, root], vis=vis, datacolumn="data", inject=[place])["products"]["sara"]
+    source = found["injected"][place]
+    assert source["injected_jy"] == pytest.approx(100 * found["natural"]["sigma"], rel=1e-6)
+    assert source["flux_jy"] == pytest.approx(source["injected_jy"], rel=0.1)
+    assert source["offset_arcsec"] < 0.3 and source["fwhm_in_beams"]["natural"] < 0.8
+
+
+def test_a_run_is_repeated_to_the_last_digits(deep):
+    """Parameters in the history are all that a run needs: without a source the same model comes out."""
+    vis, root = deep
+    one = read_image_set(root)
+    without, with_source = injection._repeat(one, [(90, 40)], 0.3, Selection((vis,), datacolumn="data"), 1)
+    peak = one.model.pixels.max()
+    np.testing.assert_allclose(without, one.model.pixels, atol=1e-4 * peak)
+    assert np.abs(with_source - without).max() > 0.1 * peak
+
+
+def test_a_run_that_is_stopped_measures_nothing(deep, monkeypatch):
+    vis, root = deep
+    solve = injection.solve_image
+
+    def stopped(*arguments):
+        solved = solve(*arguments[:-1], dataclasses.replace(arguments[-1], niter=3))
+        solved.record.stop_code = STOPPED_BY_USER
+        return solved
+
+    monkeypatch.setattr(injection, "solve_image", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        saracompare(models=[root, root], vis=vis, datacolumn="data", inject=EMPTY)
+
+
 # Refusals ---------------------------------------------------------------------------------------
 
 FAR = (CENTRE[0], CENTRE[1] + np.radians(0.1))
@@ -394,6 +496,13 @@ def test_models_beside_each_other_do_not_overlap(tmp_path):
     (dict(support="far.model"), ValueError, "support = 'far.model' holds 0 of 16384 pixels"),
     (dict(support="all.mask"), ValueError, "support = 'all.mask' holds 16384 of 16384 pixels"),
     (dict(threshold=2.0), ValueError, "threshold = 2.0"),
+    (dict(inject=EMPTY), ValueError, f"inject = '{re.escape(EMPTY)}' has no effect without vis"),
+    (dict(injectflux=1.0), ValueError, "injectflux = 1.0 has no effect without vis"),
+    (dict(frames=["one", "two"]), ValueError, "frames = .*has no effect without outdir"),
+    (dict(frames="one", outdir="new"), ValueError, r"frames = \['one'\]: should be two or more images"),
+    (dict(frames=["one", "absent"], outdir="new"), FileNotFoundError, "frames = 'absent': neither it nor"),
+    (dict(frames=["one", "oblong.model"], outdir="new"), ValueError, "frames = .*pixels of 1 x 0.5 arcsec: should be"),
+    (dict(frames=["one", "far.model"], outdir="new"), ValueError, "frames = 'far.model' has another centre"),
     (dict(robust=0.5), ValueError, "robust = 0.5 has no effect without vis"),
     (dict(scan="1"), ValueError, "scan = '1' has no effect without vis"),
     (dict(datacolumn="data"), ValueError, "datacolumn = 'data' has no effect without vis"),
@@ -408,6 +517,7 @@ def test_bad_parameters_raise_and_name_themselves(tmp_path, parameters, error, m
     product("one")
     product("two", seed=1)
     write("far.model", sky(), centre=FAR)
+    write("oblong.model", sky((64, 128), [(1.0, 0, 0)]), cell=(1.0, 0.5))
     write("all.mask", np.ones((128, 128)), "")
     Path("text.fits").write_text("no image")
     Path("full").mkdir()
@@ -418,6 +528,36 @@ def test_bad_parameters_raise_and_name_themselves(tmp_path, parameters, error, m
     ia.close()
     with pytest.raises(error, match=message):
         saracompare(**(dict(models=["one", "two"]) | parameters))
+
+
+@pytest.mark.parametrize("parameters, message", [
+    (dict(inject="19h59m28.51s"), "inject = '19h59m28.51s' is not a position: should be right ascension"),
+    (dict(inject="here there"), "inject = 'here there' is not a position"),
+    (dict(inject="0deg 0deg"), "inject = '0deg 0deg' is outside the image"),
+    (dict(inject="19h59m28.51s +40d44m33.4s"), "inject = .* is outside of 'sara', or nearer to its edge than 2.5"),
+    (dict(inject=EMPTY, models=["one", "one"]), "inject = .*needs vis, and images of tsara with their history"),
+    (dict(injectflux=1.0), "injectflux = 1.0 has no effect without inject"),
+])
+def test_injections_that_make_no_sense_are_refused(tmp_path, deep, parameters, message):
+    vis, root = deep
+    product("one")
+    with pytest.raises(ValueError, match=message):
+        saracompare(**(dict(models=[root, "one"], vis=vis, datacolumn="data") | parameters))
+
+
+def test_names_in_the_data_do_no_harm_in_the_report(tmp_path, vis):
+    """Fields, antennas, histories and records may hold anything."""
+    evil = "<script>alert('1')</script>"
+    copy = shutil.copytree(vis, tmp_path / "evil.ms")
+    edit(f"{copy}/FIELD", "NAME", lambda names: np.full_like(names, evil))
+    edit(f"{copy}/ANTENNA", "NAME", lambda names: np.array([f"{evil}{n}" for n in range(len(names))]))
+    one, *_ = product(tmp_path / "one", history=["taskname=tsara", f'field = "{evil}"', f'antenna = "{evil}&{evil}"'])
+    block = {"ms": evil, "scans": [1], "start_mjd_s": 4.9e9, "end_mjd_s": 4.9e9 + 60, "samples": 500,
+             "noise_measured": 1.0, "noise_found": 1.1, "l2_bound": 30.0}
+    jsonfile.save(one + ".sara.json", {"wild": [{"antenna1": evil}], "blocks": [block]})
+    saracompare(models=[one, one], names=[evil, "b"], vis=str(copy), datacolumn="data", outdir="report")
+    page = Path("report/report.html").read_text()
+    assert "<script" not in page and page.count("&lt;script&gt;") >= 3
 
 
 def test_an_image_without_a_beam_is_refused(tmp_path, vis):
@@ -475,6 +615,9 @@ def test_overwrite_replaces_the_report_and_leaves_other_files(tmp_path):
     found = saracompare(models=[one, one], names=["a", "b"], outdir="report", overwrite=True)
     assert jsonfile.load("report/measures.json") == found and list(found["products"]) == ["a", "b"]
     assert Path("report/mine.txt").read_text() == "mine"
+    Path("report/report.files").unlink()
+    with pytest.raises(FileExistsError, match="outdir = 'report' holds report.html, measures.json, not of an earlier"):
+        saracompare(models=[one, one], outdir="report", overwrite=True)
 
 
 # Task -------------------------------------------------------------------------------------------

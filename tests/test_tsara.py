@@ -196,8 +196,8 @@ def test_a_failed_run_leaves_the_old_products(run, vis, tmp_path, monkeypatch):
     for product in PRODUCTS:
         shutil.copytree(f"{run[1]}.{product}", f"{name}.{product}")
     before = _hashes(tmp_path)
-    monkeypatch.setattr("casa_sara.casa.products.restore", lambda *args: (_ for _ in ()).throw(RuntimeError("no space")))
-    with pytest.raises(RuntimeError, match="no space"):
+    monkeypatch.setattr("casa_sara.imaging.sum_of_weights", lambda *args: "not a number")
+    with pytest.raises(ValueError, match="not a number"):
         tsara(vis=vis, imagename=name, overwrite=True, niter=0, **GRID)
     assert _hashes(tmp_path) == before
 
@@ -285,7 +285,6 @@ def test_corrected_column_absent_is_said_loudly(vis, tmp_path):
     (dict(databound="fixed"), "l2bound"),
     (dict(databound="fixed", l2bound=[-1.0]), "l2bound"),
     (dict(databound="fixed", l2bound=[1.0, 2.0, 3.0]), "l2bound"),
-    (dict(restart=True), "restart"),
     (dict(startmodel="absent.model"), "startmodel"),
     (dict(parallel=True), "parallel"),
     (dict(blocks=-1), "blocks"),
@@ -356,3 +355,6 @@ def test_a_report_of_the_run(vis, tmp_path):
     assert all(words in page for words in ("natural weighting", "briggs weighting", "Convergence", "c.ms"))
     with pytest.raises(FileExistsError, match="run.report"):
         tsara(vis=vis, imagename=str(name), report=True, niter=40, **GRID)
+    (tmp_path / "run.report" / "mine.txt").write_text("mine")
+    tsara(vis=vis, imagename=str(name), niter=20, overwrite=True, **GRID)
+    assert [path.name for path in (tmp_path / "run.report").iterdir()] == ["mine.txt"]  # the report was of older images

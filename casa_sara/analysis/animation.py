@@ -12,7 +12,9 @@ from PIL import Image
 
 from casa_sara.analysis.sheets import BRIGHTNESS_MAP, DPI, plain, prefix
 
-__all__ = ["animate"]
+__all__ = ["animate", "has_emission"]
+
+SIDE = 4.2  # of a square frame without its labels, in inches
 
 
 def animate(path, frames: Sequence[tuple[str, np.ndarray, float]], zoom=None, decades=3.0, seconds=1.2) -> None:
@@ -26,7 +28,7 @@ def animate(path, frames: Sequence[tuple[str, np.ndarray, float]], zoom=None, de
         Title, model (nx, ny) in Jy/pixel and pixel size in arcsec; pixel (nx//2, ny//2) of all is the same point.
     zoom : (float, float, float), optional
         The part that is shown: centre in arcsec to the east and to the north, and side in arcsec. By default
-        what all frames have in common.
+        as much as the smallest of the frames has.
     decades : float
         Range of the logarithmic scale of brightness, which is the same in all frames.
     seconds : float
@@ -34,14 +36,29 @@ def animate(path, frames: Sequence[tuple[str, np.ndarray, float]], zoom=None, de
     """
     if not frames:
         raise ValueError("frames is empty: there is nothing to animate")
-    zoom = zoom or (0.0, 0.0, min(min(image.shape) * cell for _, image, cell in frames))
-    peak = np.median([_peak(image / cell**2, cell, zoom) for _, image, cell in frames])
+    part = _part(frames, zoom)
+    if not has_emission(frames, zoom):
+        raise ValueError(f"zoom={zoom} holds no emission of one of the frames")
+    peak = np.median([_peak(image, cell, part) / cell**2 for _, image, cell in frames])
     factor, sign = prefix(peak)
     norm = LogNorm(peak * factor / 10**decades, peak * factor)
-    drawn = [_frame(title, image * factor / cell**2, cell, zoom, (norm, f"{sign}Jy arcsec$^{{-2}}$"))
+    drawn = [_frame(title, image * factor / cell**2, cell, part, (norm, f"{sign}Jy arcsec$^{{-2}}$"))
              for title, image, cell in frames]
     waits = [int(1e3 * seconds)] * (len(drawn) - 1) + [int(2e3 * seconds)]
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=waits, loop=0)
+
+
+def has_emission(frames, zoom) -> bool:
+    """Tell whether every frame has emission in the part of the sky that `animate` would show of it."""
+    return all(_peak(image, cell, _part(frames, zoom)) > 0 for _, image, cell in frames)
+
+
+def _part(frames, zoom) -> tuple[float, float, float, float]:
+    """Return centre to the east and to the north, width and height of what is shown, in arcsec."""
+    if zoom is not None:
+        return (*zoom, zoom[2])
+    width, height = (min(image.shape[axis] * cell for _, image, cell in frames) for axis in (0, 1))
+    return 0.0, 0.0, width, height
 
 
 def _edges(shape, cell):
@@ -50,28 +67,28 @@ def _edges(shape, cell):
     return (nx // 2 + 0.5) * cell, (nx // 2 + 0.5 - nx) * cell, -(ny // 2 + 0.5) * cell, (ny - ny // 2 - 0.5) * cell
 
 
-def _peak(image, cell, zoom) -> float:
-    """Return the peak within the zoom."""
+def _peak(image, cell, part) -> float:
+    """Return the peak within a part, 0 where the image does not reach."""
     nx, ny = image.shape
     east, north = (nx // 2 - np.arange(nx)) * cell, (np.arange(ny) - ny // 2) * cell
-    inside = image[np.abs(east - zoom[0]) <= zoom[2] / 2][:, np.abs(north - zoom[1]) <= zoom[2] / 2]
-    if inside.size == 0 or not np.nanmax(inside) > 0:
-        raise ValueError(f"zoom={zoom} holds no emission of an image of {nx} × {ny} pixels of {cell:g} arcsec")
-    return float(np.nanmax(inside))
+    inside = image[np.abs(east - part[0]) <= part[2] / 2][:, np.abs(north - part[1]) <= part[3] / 2]
+    return float(np.nanmax(inside)) if inside.size else 0.0
 
 
-def _frame(title, image, cell, zoom, scale) -> Image.Image:
+def _frame(title, image, cell, part, scale) -> Image.Image:
     """Draw one frame; `scale` is the norm and the unit."""
     norm, unit = scale
-    east, north, side = zoom
-    figure = Figure(figsize=(5.6, 5.0), dpi=DPI, facecolor="white", layout="constrained")
+    east, north, width, height = part
+    size = SIDE * np.sqrt(width / height), SIDE * np.sqrt(height / width)
+    figure = Figure(figsize=(size[0] + 1.5, size[1] + 0.9), dpi=DPI, facecolor="white", layout="compressed")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
     drawn = axes.imshow(np.maximum(image, norm.vmin).T, origin="lower", extent=_edges(image.shape, cell), norm=norm,
                         cmap=BRIGHTNESS_MAP, interpolation="nearest")
     axes.set_facecolor("0.6")  # beyond the image
-    axes.set(xlim=(east + side / 2, east - side / 2), ylim=(north - side / 2, north + side / 2))
+    axes.set(xlim=(east + width / 2, east - width / 2), ylim=(north - height / 2, north + height / 2))
     axes.set_title(f'{plain(title)} ({cell:.3g}" pixels)', fontsize=11)
+    axes.locator_params(nbins=6)
     axes.set_xlabel("east [arcsec]", fontsize=10)
     axes.set_ylabel("north [arcsec]", fontsize=10)
     figure.colorbar(drawn, ax=axes, pad=0.02).set_label(unit, fontsize=10)

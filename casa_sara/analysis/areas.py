@@ -11,7 +11,7 @@ from astropy.coordinates import Angle, SkyCoord
 from astropy.wcs import WCS
 from regions import CirclePixelRegion, CircleSkyRegion, PixCoord, PixelRegion, Regions, SkyRegion
 
-__all__ = ["Frame", "region_masks"]
+__all__ = ["Frame", "places", "region_masks"]
 
 RIGHT = "a circle as '19h59m28.3s +40d44m02s 1.5arcsec', or a CRTF or DS9 file or line; 'name = ' may stand before it"
 
@@ -87,6 +87,31 @@ def region_masks(texts, frame: Frame, parameter="regions") -> dict[str, np.ndarr
             name = _unused(given.strip() or str(label).strip("{}'\""), masks)
             masks[name] = _mask(region, frame, f"{parameter} = '{text}'")
     return masks
+
+
+def places(texts, frame: Frame, parameter) -> dict[str, tuple[float, float]]:
+    """Return positions 'RA DEC' as pixel coordinates, by their texts.
+
+    Raises
+    ------
+    ValueError
+        A text is no position, or one outside the image.
+    """
+    found = {}
+    for text in texts:
+        wrong = f"{parameter} = '{text}' is not a position: should be right ascension and declination, as " \
+                "'19h59m28.3s +40d44m02s'"
+        if len(text.split()) != 2:
+            raise ValueError(wrong)
+        try:
+            place = SkyCoord(text)
+        except Exception as error:  # of many kinds, from the parser
+            raise ValueError(f"{wrong} ({error})") from None
+        x, y = (float(axis) for axis in frame.wcs.world_to_pixel(place))
+        if not (0 <= x <= frame.shape[0] - 1 and 0 <= y <= frame.shape[1] - 1):  # NaN beyond the horizon
+            raise ValueError(f"{parameter} = '{text}' is outside the image, which is centred on {_spell(frame)}")
+        found[text] = x, y
+    return found
 
 
 def _parse(body, text, parameter):

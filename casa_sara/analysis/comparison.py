@@ -61,14 +61,18 @@ class Comparison:
         Name → bool mask (nx, ny).
     measures : dict
         Plain numbers, strings, lists and dicts only:
-        `products` → name → {flux_jy, peak_jy_per_pixel, negative_jy, mdr, fwhm_recovered_arcsec, regions → {name →
+        `products` → name → {flux_jy, peak_jy_per_pixel, negative_jy, mdr, fwhm_recovered_arcsec, injected → {source →
+        {injected_jy, flux_jy, offset_arcsec, fwhm_arcsec, fwhm_in_beams → {weighting → ratio}}}, regions → {name →
         {flux_jy, error_jy}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness, chi_square →
-        [of each block]}, truth → {snr, log_snr, ssim, snr_at_scale → {arcsec → dB}}} and
+        [of each block]}, truth → {snr, log_snr, ssim, ssim_range_jy_per_pixel, snr_at_scale → {arcsec → dB}}} and
         `similarity` → weighting → {'one|other' → S in dB}; what could not be measured is left out.
     versions : dict
         Package → version.
     notes : tuple of str
         Warnings for the reader.
+    frames : tuple of (str, ndarray, float)
+        Title, model in Jy/pixel and pixel size in arcsec of reconstructions with different pixels, to be animated;
+        pixel (nx//2, ny//2) of each is at `centre_deg`.
     """
 
     products: tuple[Product, ...]
@@ -81,3 +85,4 @@ class Comparison:
     measures: dict[str, Any]
     versions: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    frames: tuple[tuple[str, np.ndarray, float], ...] = ()

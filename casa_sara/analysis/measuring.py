@@ -127,7 +127,8 @@ def _against_truth(product, truth, cell_arcsec, beams):
         },
     }
     if min(truth.shape) > 11:
-        found["ssim"] = metrics.ssim(truth, product.model, float(truth.max()))
+        found["ssim_range_jy_per_pixel"] = float(truth.max())
+        found["ssim"] = metrics.ssim(truth, product.model, found["ssim_range_jy_per_pixel"])
     entry = {"truth": found}
     point = metrics.isolated_point(truth)
     if point is not None:

@@ -20,7 +20,7 @@ def snr(truth, model) -> float:
     """Return 20 log10(‖truth‖ / ‖truth − model‖) in dB; both of one shape and unit."""
     truth, model = _alike(truth, model)
     error = np.linalg.norm(truth - model)
-    return float(20 * np.log10(np.linalg.norm(truth) / error)) if error > 0 else float("inf")
+    return float("inf") if error == 0 else float(20 * np.log10(np.linalg.norm(truth) / error))
 
 
 def log_snr(truth, model, dynamic_range=1e3) -> float:

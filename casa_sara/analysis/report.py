@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +10,10 @@ import jinja2
 import numpy as np
 from PIL import Image
 
+from casa_sara import jsonfile
 from casa_sara.analysis import animation, convergence, diagnostics, pages
 from casa_sara.analysis.comparison import Comparison
+from casa_sara.analysis.folder import MEASURES, PAGE, replaced
 from casa_sara.analysis.sheets import DPI
 from casa_sara.analysis.tables import tables
 from casa_sara.analysis.zooms import find_zooms
@@ -43,43 +44,45 @@ class Picture:
             return tuple(round(100 * pixels / DPI) for pixels in image.size)
 
 
-def write_report(comparison: Comparison, folder: Path, title: str = "SARA imaging report",
-                 frames: Sequence[tuple[str, np.ndarray, float]] = (),
-                 zoom: tuple[float, float, float] | None = None) -> Path:
-    """Write the pictures of a comparison and report.html, which holds them all.
+def write_report(comparison: Comparison, folder: Path, title: str = "SARA imaging report") -> Path:
+    """Write the pictures of a comparison, report.html, which holds them all, and measures.json.
 
-    Sections for which there is nothing are left out.
+    Sections for which there is nothing are left out. The files of an earlier report are replaced, all together, when
+    the new ones are complete; other files stay.
 
     Parameters
     ----------
     comparison : Comparison
         Of one product or more.
     folder : Path
-        Made if it is not there; files of an earlier report are replaced.
+        Made if it is not there.
     title : str
-    frames : sequence of (str, ndarray, float), optional
-        Title, model in Jy/pixel and pixel size in arcsec of reconstructions with different pixels, to be animated.
-    zoom : (float, float, float), optional
-        The part of the frames that is shown: centre in arcsec to the east and to the north, and side in arcsec.
 
     Returns
     -------
     Path
         Of report.html.
+
+    Raises
+    ------
+    FileExistsError
+        A file that is not of an earlier report has the name of one of the report's.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    pictures = [*_sky(comparison, folder)]
-    if frames:
-        animation.animate(folder / "cells.png", frames, zoom)
-        pictures.append(Picture(folder / "cells.png", "sky", "From coarse to fine pixels", "One part of the sky, "
-                                "imaged with different pixel sizes, on one logarithmic scale."))
-    pictures += [*_residuals(comparison, folder), *_runs(comparison, folder)]
+    with replaced(folder) as new:
+        jsonfile.save(new / MEASURES, comparison.measures)
+        pictures = [*_sky(comparison, new), *_frames(comparison, new), *_residuals(comparison, new),
+                    *_runs(comparison, new)]
+        (new / PAGE).write_text(_page(comparison, title, pictures), encoding="utf-8")
+    return folder / PAGE
+
+
+def _page(comparison, title, pictures) -> str:
+    """Return the page."""
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                   lstrip_blocks=True).get_template(TEMPLATE)
-    page = folder / "report.html"
-    page.write_text(template.render(
+    return template.render(
         title=title,
         comparison=comparison,
         shape=comparison.products[0].model.shape,
@@ -89,8 +92,7 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
         is_single=len(comparison.products) == 1,
         has_residuals=any(product.residual for product in comparison.products),
         negative=_negative(comparison),
-    ), encoding="utf-8")  # fmt: skip
-    return page
+    )  # fmt: skip
 
 
 def _sky(comparison, folder) -> list[Picture]:
@@ -115,6 +117,23 @@ def _sky(comparison, folder) -> list[Picture]:
         made.append(Picture(path, "sky", "Differences", f"Models minus that of {what}, as they are and smoothed with "
                             "each CLEAN beam. Red: more than there; blue: less. The scales are linear and end at the "
                             "99.8th percentile."))
+    return made
+
+
+def _frames(comparison, folder) -> list[Picture]:
+    """Animate the images on different pixels: the field, and the regions in which all of them have emission."""
+    if not comparison.frames:
+        return []
+    parts = [("the field", None)]
+    if comparison.regions:
+        parts += [(zoom.name, zoom.on_sky(comparison)) for zoom in find_zooms(comparison)]
+    made = []
+    for number, (name, zoom) in enumerate(parts):
+        path = folder / (f"cells_{number}.png" if number else "cells.png")
+        if zoom is None or animation.has_emission(comparison.frames, zoom):
+            animation.animate(path, comparison.frames, zoom)
+            made.append(Picture(path, "frames", f"Pixel by pixel: {name}", "One part of the sky, imaged with different "
+                                "pixels, on one logarithmic scale. Grey: beyond an image."))
     return made
 
 

@@ -2,42 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from casa_sara.analysis.sheets import prefix
+from casa_sara.analysis.columns import Table, build, fixed, is_number, number
 
-__all__ = ["Table", "as_text", "number", "tables"]
+__all__ = ["as_text", "tables"]
 
-NOTHING = "–"
 WEIGHTINGS = ("natural", "briggs")
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of text: title, heads of the columns, their units, rows (the first cell names the row), explanation."""
-
-    title: str
-    heads: tuple[str, ...]
-    units: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    caption: str = ""
-
-
-def number(value, digits: int = 4) -> str:
-    """Return a number with some significant digits; a dash for what there is not, ∞ for infinity."""
-    if value is None or isinstance(value, float) and np.isnan(value):
-        return NOTHING
-    if not isinstance(value, (int, float, np.number)):
-        return str(value)
-    if np.isinf(value):
-        return "∞" if value > 0 else "−∞"
-    if value != 0 and not 1e-3 <= abs(value) < 1e7:
-        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        return f"{mantissa}e{int(exponent)}".replace("-", "−")
-    decimals = max(digits - 1 - int(np.floor(np.log10(abs(value)))), 0) if value != 0 else 0
-    return f"{value:,.{decimals}f}".replace("-", "−")
 
 
 REGION_TABLES = (
@@ -57,9 +28,9 @@ def tables(comparison) -> list[Table]:
     measured = comparison.measures.get("products", {})
     names = [product.name for product in comparison.products if product.name in measured]
     measured = {name: measured[name] for name in names}
-    made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS),
+    made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS), _blocks(measured),
             *(_regions(measured, *of) for of in REGION_TABLES), _truth(measured),
-            _similarity(comparison.measures.get("similarity", {}))]
+            _injected(measured, comparison.beams), _similarity(comparison.measures.get("similarity", {}))]
     return [table for table in made if table is not None]
 
 
@@ -70,52 +41,6 @@ def as_text(comparison) -> str:
     return "\n\n".join(parts) + "\n" if parts else "nothing was measured\n"
 
 
-def _build(title, columns, measured, caption="") -> Table | None:
-    """Make a table of products from columns (key, head, unit), leaving out what no product has."""
-    columns = [column for column in columns if any(column[0] in entry for entry in measured.values())]
-    if not columns:
-        return None
-    values = [[entry.get(key) for entry in measured.values()] for key, _, _ in columns]
-    scales = {unit: _scale([column for column, (_, _, its) in zip(values, columns) if its == unit])
-              for _, _, unit in columns if unit.startswith("Jy")}
-    units, texts = zip(*(_column(column, unit, scales) for column, (_, _, unit) in zip(values, columns)))
-    rows = tuple((name, *cells) for name, *cells in zip(measured, *texts))
-    return Table(title, ("", *(head for _, head, _ in columns)), ("", *units), rows, caption)
-
-
-def _scale(columns) -> tuple[float, str]:
-    """Return factor and prefix for columns of one unit; the fainter ones may be below 1."""
-    peaks = [max((abs(value) for value in column if _is_number(value)), default=0) for column in columns]
-    peaks = [peak for peak in peaks if peak > 0]
-    return prefix(10 * min(peaks)) if peaks else (1.0, "")
-
-
-def _column(values, unit, scales) -> tuple[str, list[str]]:
-    """Return the unit of a column and its numbers in that unit, with one number of decimals where that says enough."""
-    factor, sign = scales.get(unit, (1.0, ""))
-    finite = [abs(float(value)) for value in values if _is_number(value) and value != 0]
-    if not finite:
-        return sign + unit, [number(value) for value in values]
-    if unit == "dB":
-        return unit, [_fixed(value, 1) for value in values]
-    values = [value * factor if _is_number(value) else value for value in values]
-    largest, least = max(finite) * factor, min(finite) * factor
-    decimals = max(3 - int(np.floor(np.log10(largest))), 0)
-    if not unit:  # ratios and moments
-        decimals = min(decimals, 0 if largest >= 100 else 1 if largest >= 10 else 3)
-    if largest >= 1e7 or least < 2 * 10.0**-decimals:
-        return sign + unit, [number(value, 3) for value in values]
-    return sign + unit, [_fixed(value, decimals) for value in values]
-
-
-def _is_number(value) -> bool:
-    return isinstance(value, (int, float, np.number)) and bool(np.isfinite(value))
-
-
-def _fixed(value, decimals) -> str:
-    return f"{value:,.{decimals}f}".replace("-", "−") if _is_number(value) else number(value)
-
-
 def _models(measured):
     columns = [
         ("flux_jy", "flux", "Jy"),
@@ -124,15 +49,15 @@ def _models(measured):
         ("mdr", "MDR", ""),
         ("fwhm_recovered_arcsec", "width of a point", "arcsec"),
     ]
-    caption = (
-        "MDR: peak of the model over the brightest pixel outside of the source. Width of a point: full width at half "
-        "maximum, in the model, of the brightest unresolved source that stands alone in the truth."
-    )
-    return _build("Models", columns, measured, caption)
+    caption = "MDR: peak of the model over the brightest pixel outside of the source."
+    if any("fwhm_recovered_arcsec" in entry for entry in measured.values()):
+        caption += (" Width of a point: full width at half maximum, in the model, of the brightest unresolved source "
+                    "that stands alone in the truth.")
+    return build("Models", columns, measured, caption)
 
 
 def _residuals(measured, weighting):
-    entries = {name: _flat(entry[weighting]) for name, entry in measured.items() if weighting in entry}
+    entries = {name: entry[weighting] for name, entry in measured.items() if weighting in entry}
     columns = [
         ("sigma", "σ", "Jy/beam"),
         ("max_abs", "largest |r|", "Jy/beam"),
@@ -141,25 +66,28 @@ def _residuals(measured, weighting):
         ("skewness", "skewness", ""),
         ("kurtosis", "kurtosis", ""),
         ("whiteness", "whiteness", ""),
-        ("chi_square", "χ² of the blocks", ""),
     ]
     caption = (
         "Residual images of all products made with one operator and the same weights. DR: peak of the restored image "
-        "over σ, the standard deviation of the residual image. χ² of the blocks: median, least and most."
+        "over σ, the standard deviation of the residual image."
     )
-    return _build(f"Residual and restored images, {weighting} weighting", columns, entries, caption)
+    return build(f"Residual and restored images, {weighting} weighting", columns, entries, caption)
 
 
-def _flat(entry):
-    """Return the measures of one weighting with χ² of the blocks in words."""
-    chi = entry.get("chi_square")
-    if chi is None or not np.size(chi):
-        return {key: value for key, value in entry.items() if key != "chi_square"}
-    chi = np.atleast_1d(np.asarray(chi, float))
-    text = number(float(np.median(chi)), 3)
-    if chi.size > 1:
-        text += f" ({number(float(chi.min()), 3)}–{number(float(chi.max()), 3)})"
-    return {**entry, "chi_square": text}
+def _blocks(measured):
+    """χ² of the blocks: how many there are, and their median and extremes."""
+    entries = {}
+    for name, entry in measured.items():
+        chi = np.atleast_1d(np.asarray(entry.get("natural", {}).get("chi_square", []), float))
+        if chi.size:
+            entries[name] = {"blocks": str(chi.size), "median": float(np.median(chi)), "least": float(chi.min()),
+                             "most": float(chi.max())}
+    columns = [("median", "median", ""), ("least", "least", ""), ("most", "most", ""), ("blocks", "blocks", "")]
+    caption = (
+        "Of each block, the sum of w|r|² of its residual visibilities over twice their number: 1 where the model "
+        "leaves noise as the weights say, less where it has fitted noise."
+    )
+    return build("χ² of the blocks", columns, entries, caption)
 
 
 def _regions(measured, key, title, caption):
@@ -181,10 +109,10 @@ def _regions(measured, key, title, caption):
 
 def _with_error(value, error) -> str:
     """Return a value and its error with two significant digits of the error."""
-    if not (_is_number(value) and _is_number(error) and error > 0):
+    if not (is_number(value) and is_number(error) and error > 0):
         return number(value)
     decimals = max(1 - int(np.floor(np.log10(error))), 0)
-    return f"{_fixed(value, decimals)} ± {_fixed(error, decimals)}"
+    return f"{fixed(value, decimals)} ± {fixed(error, decimals)}"
 
 
 def _truth(measured):
@@ -194,13 +122,41 @@ def _truth(measured):
         name: {**entry, **{("scale", scale): value for scale, value in entry.get("snr_at_scale", {}).items()}}
         for name, entry in entries.items()
     }
-    columns = [("snr", "SNR", "dB"), ("log_snr", "log SNR", "dB"), ("ssim", "SSIM", "")]
+    columns = [("snr", "SNR", "dB"), ("log_snr", "log SNR", "dB"), ("ssim", "SSIM", ""),
+               ("ssim_range_jy_per_pixel", "its range", "Jy/pixel")]
     columns += [(("scale", scale), f'SNR at {float(scale):.3g}"', "dB") for scale in scales]
     caption = (
         "SNR: norm of the truth over that of the error. Log SNR: the same of the images on a logarithmic scale, where "
-        "faint emission counts. SNR at a scale: both smoothed to that width."
+        "faint emission counts. SSIM, the structural similarity, 1 for equal images, of values within its range: 0 to "
+        "the peak of the truth. SNR at a scale: both smoothed to that width."
     )
-    return _build("Against the truth", columns, flat, caption)
+    return build("Against the truth", columns, flat, caption)
+
+
+def _injected(measured, beams):
+    """What became of injected sources; restored images have the width of the beam."""
+    found = {f"{name}, {place}": source for name, entry in measured.items()
+             for place, source in entry.get("injected", {}).items()}
+    if not found:
+        return None
+    widths = {weighting: float(np.sqrt(beam[0] * beam[1])) for weighting, beam in beams.items()}
+    rows = {
+        name: {**source, "percent": 100 * source["flux_jy"] / source["injected_jy"], **source.get("fwhm_in_beams", {})}
+        for name, source in found.items()
+    }
+    rows |= {f"restored images, {name} weighting": {"fwhm_arcsec": width}
+             | {other: width / size for other, size in widths.items()} for name, width in widths.items()}
+    columns = [("injected_jy", "injected", "Jy"), ("flux_jy", "recovered", "Jy"), ("percent", "recovered", "%"),
+               ("offset_arcsec", "offset", "arcsec"), ("fwhm_arcsec", "width", "arcsec"),
+               *((name, "width", f"{name} beams") for name in widths)]
+    caption = (
+        "Point sources put into the visibilities, which tsara then imaged again, without and with them; measured is "
+        f"the difference of the two models, in a circle of {number(min(widths.values()), 3)}″ (the finest beam's width) "
+        "around the source. Width: of the circle that holds half of the flux, which is the full width at half maximum "
+        "of a Gaussian. A restored image has the width of its beam by definition; other imagers were not run again, so "
+        "how wide a point is in their models is not known."
+    )
+    return build("Injected point sources: resolution reached", columns, rows, caption)
 
 
 def _similarity(similarity):
@@ -208,7 +164,7 @@ def _similarity(similarity):
     if not found:
         return None
     pairs = list(dict.fromkeys(pair for entry in found.values() for pair in entry))
-    rows = tuple((pair.replace("|", " and "), *(_fixed(entry.get(pair), 1) for entry in found.values()))
+    rows = tuple((pair.replace("|", " and "), *(fixed(entry.get(pair), 1) for entry in found.values()))
                  for pair in pairs)
     caption = "S of two models smoothed with the CLEAN beam of each weighting: norm of the larger over the difference."
     heads = ("", *(f"S, {weighting} beam" for weighting in found))

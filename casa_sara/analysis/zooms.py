@@ -21,6 +21,13 @@ class Zoom:
     name: str
     box: tuple[int, int, int, int]
 
+    def on_sky(self, comparison) -> tuple[float, float, float]:
+        """Return its centre in arcsec to the east and to the north of the grid's, and its side in arcsec."""
+        x0, x1, y0, y1 = self.box
+        (nx, ny), cell = comparison.products[0].model.shape, comparison.cell_arcsec
+        east, north = (nx // 2 - (x0 + x1 - 1) / 2) * cell[0], ((y0 + y1 - 1) / 2 - ny // 2) * cell[1]
+        return east, north, max((x1 - x0) * cell[0], (y1 - y0) * cell[1])
+
 
 def reference(comparison) -> np.ndarray:
     """Return the model that sets scales and zooms, Jy/pixel: the truth, or the first product's."""

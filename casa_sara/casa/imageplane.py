@@ -6,14 +6,13 @@ CASA's own synthesisimager makes them from the selected data, so they are tclean
 from __future__ import annotations
 
 import os
-import tempfile
 from dataclasses import dataclass
 
 import numpy as np
 
 from casa_sara.casa.integrity import reading
 from casa_sara.casa.quantities import check_frequency
-from casa_sara.casa.tools import opened
+from casa_sara.casa.tools import opened, scratch_folder
 
 __all__ = ["ImagePlane", "define_image_plane", "read_pixels", "slabs"]
 
@@ -76,7 +75,7 @@ def define_image_plane(visibilities, selection, grid):
     """
     if grid.reffreq:
         check_frequency(grid.reffreq, "reffreq")
-    with tempfile.TemporaryDirectory(prefix="casa_sara_") as folder:
+    with scratch_folder(grid.shape) as folder:
         root = os.path.join(folder, "plane")
         _make_primary_beam(visibilities, selection, grid, root)
         with opened("image", root + ".pb") as ia:

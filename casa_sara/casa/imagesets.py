@@ -7,11 +7,13 @@ import os
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
+
 from casa_sara.casa.products import RECORD
 from casa_sara.casa.record import read_record
 from casa_sara.casa.skyimage import SkyImage, read_header, read_sky_image
 
-__all__ = ["ImageSet", "check_same_data", "data_names", "read_image_set"]
+__all__ = ["ImageSet", "check_same_data", "data_names", "read_frames", "read_image_set"]
 
 _SUFFIXES = ("", ".fits")
 _NAMES = (".model", ".model.fits", ".fits")
@@ -80,7 +82,7 @@ def read_image_set(given, name="", with_residual=True):
     FileNotFoundError, ValueError
         There is no model, or an image is not as it should be.
     """
-    path, root = _model_path(given)
+    path, root = _model_path(given, "models")
     model = read_sky_image(path, "models", ("Jy/pixel",))
     found = _beside(root, ".residual")
     residual = read_sky_image(found, "models", ("Jy/beam", "")) if found and with_residual else None
@@ -94,6 +96,42 @@ def read_image_set(given, name="", with_residual=True):
                     parameters | model.parameters, read_record(record) if os.path.isfile(record) else {})
 
 
+def read_frames(names, plane):
+    """Read models of one sky on different pixels, to be shown one after the other.
+
+    Parameters
+    ----------
+    names : sequence of str
+        As the products are given.
+    plane : SkyPlane
+        Its centre is theirs.
+
+    Returns
+    -------
+    tuple of (str, float32 (nx, ny), float)
+        Name without folder, model in Jy/pixel and pixel size in arcsec.
+
+    Raises
+    ------
+    FileNotFoundError, ValueError
+        There is but one, a model is absent or not as it should be, or lies otherwise on the sky.
+    """
+    if len(names) == 1:
+        raise ValueError(f"frames = {list(names)}: should be two or more images, in the order to show them")
+    frames = []
+    for given in names:
+        path, root = _model_path(given, "frames")
+        image = read_sky_image(path, "frames", ("Jy/pixel",))
+        cell = np.degrees(image.plane.cell_rad) * 3600
+        if not image.is_aligned(plane):
+            raise ValueError(f"frames = '{given}' has another centre, or axes, than the first of models: should be "
+                             "images of one field, with a pixel on one centre")
+        if not np.isclose(*cell, rtol=1e-6):
+            raise ValueError(f"frames = '{given}' has pixels of {cell[0]:.4g} x {cell[1]:.4g} arcsec: should be square")
+        frames.append((os.path.basename(root), image.pixels, float(cell[1])))
+    return tuple(frames)
+
+
 def check_same_data(sets):
     """Raise ValueError when the histories of the products name different MeasurementSets."""
     first, *others = [(one, one.data) for one in sets if one.data] or [(None, None)]
@@ -104,7 +142,7 @@ def check_same_data(sets):
                              "compared: give vis, and all are held against the same visibilities")
 
 
-def _model_path(given):
+def _model_path(given, parameter):
     """Return the path of the model image and the root of the names beside it."""
     given = given.rstrip("/")
     if os.path.exists(given):
@@ -117,8 +155,8 @@ def _model_path(given):
         if os.path.exists(given + suffix):
             return given + suffix, given
     tried = ", ".join(f"'{given}{suffix}'" for suffix in _NAMES)
-    raise FileNotFoundError(f"models = '{given}': neither it nor {tried} exists: should be the images' common root, a "
-                            "model image or a FITS file")
+    raise FileNotFoundError(f"{parameter} = '{given}': neither it nor {tried} exists: should be the images' common "
+                            "root, a model image or a FITS file")
 
 
 def _beside(root, kind):

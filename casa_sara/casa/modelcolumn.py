@@ -2,28 +2,38 @@
 
 This is the only place where a user's MeasurementSet is changed, so it comes last in a run
 and is checked before: `check_model_column_writable` can be called before hours are spent.
+
+A child process writes it, because CASA ends a process that finds the disk full. While a column is written the
+file MODEL_DATA.incomplete stands in its MeasurementSet, to which CASA pays no attention. A run that is killed leaves
+it there.
 """
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
-import signal
-import threading
+import socket
 import zlib
-from contextlib import contextmanager
+from datetime import datetime, timezone
+from pathlib import Path
 
 import numpy as np
 
+from casa_sara.casa.child import ChildError, in_child
 from casa_sara.casa.frames import Geometry
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
+from casa_sara.interrupt import signals_deferred
 
-__all__ = ["check_model_column_writable", "write_model_column"]
+__all__ = [
+    "INCOMPLETE", "check_model_column_writable", "incomplete_columns", "save_model_column", "write_model_column",
+]
 
+INCOMPLETE = "MODEL_DATA.incomplete"
 _COLUMN = "MODEL_DATA"
 _CHUNK = 1_000_000  # visibilities predicted at a time
-_SPARE = 1.05  # of the disk space computed
+_SPARE, _OVERHEAD = 1.05, 200_000  # of the disk space computed; bytes for descriptions of tables, which CASA rewrites
 
 
 def check_model_column_writable(selection):
@@ -53,12 +63,22 @@ def check_model_column_writable(selection):
         bytes_so_far, _ = needed.get(device, (0, None))
         needed[device] = bytes_so_far + _column_bytes(ms.name), ms.name
     for count, name in needed.values():
-        free = shutil.disk_usage(name).free
-        if count * _SPARE > free:
-            raise OSError(
-                f"savemodel = 'modelcolumn' needs {count * _SPARE / 1e9:.2f} GB for {_COLUMN}, but the disk of "
-                f"'{name}' has {free / 1e9:.2f} GB left: free some, or set savemodel = 'none'"
-            )
+        _check_space(name, count)
+
+
+def _check_space(name, count):
+    """Raise unless the disk of a MeasurementSet has room for columns to be added, of so many bytes."""
+    needed, free = count * _SPARE + _OVERHEAD, shutil.disk_usage(name).free
+    if needed > free:
+        raise OSError(
+            errno.ENOSPC, f"savemodel = 'modelcolumn' needs {needed / 1e6:.1f} MB for {_COLUMN}, but the disk of "
+            f"'{name}' has {free / 1e6:.1f} MB left: free some, or set savemodel = 'none'"
+        )
+
+
+def incomplete_columns(vis):
+    """Return which of these MeasurementSets hold a model column that a killed run left half written."""
+    return [name for name in vis if os.path.exists(os.path.join(name, INCOMPLETE))]
 
 
 def _column_bytes(name):
@@ -98,17 +118,84 @@ def write_model_column(selection, phase_center, predict):
         When what is read back is not what was written.
     """
     for ms in select_data(selection)[0]:
-        with _signals_deferred():
-            _make_column(ms.name)
+        with signals_deferred():
+            _mark(ms.name)
+            with opened("calibrater", ms.name, addcorr=False, addmodel=True) as cb:
+                cb.delmod(otf=True, scr=False)
             written = _write(ms, Geometry(ms, phase_center), predict)
             if written != [_checksum(values) for values in _read_back(ms)]:
                 raise RuntimeError(f"{_COLUMN} of '{ms.name}' does not read back as it was written: do not use it")
+            os.unlink(os.path.join(ms.name, INCOMPLETE))
 
 
-def _make_column(name):
-    """Delete a model in the header; add the column where it is missing."""
-    with opened("calibrater", name, addcorr=False, addmodel=True) as cb:
-        cb.delmod(otf=True, scr=False)
+def _mark(name):
+    """Say in the MeasurementSet that its model column is not to be used."""
+    since = datetime.now(timezone.utc).isoformat(" ", "seconds")
+    Path(name, INCOMPLETE).write_text(
+        f"Process {os.getpid()} on {socket.gethostname()} began to write {_COLUMN} at {since}. Where it has ended, the "
+        "column is incomplete: tsara with restart=True, niter=0, savemodel='modelcolumn' writes it anew.\n",
+        encoding="utf-8")
+
+
+def save_model_column(vis, write, **request):
+    """Have a child process write the model columns, signals deferred.
+
+    Until a column has been added whole, the description of its table is the old one, and new files beside it belong to
+    nothing: they are removed when the child fails. Where this process holds a MeasurementSet open elsewhere a
+    child would wait for it forever, and this process writes.
+
+    Parameters
+    ----------
+    vis : sequence of str
+        The MeasurementSets.
+    write : callable
+        Calls `write_model_column`: the function that the child's job 'column' names.
+    **request
+        Its arguments.
+
+    Raises
+    ------
+    OSError
+        A disk has no room; the message says which MeasurementSets hold an unfinished column, if any.
+    RuntimeError
+        For anything else that the child could not do.
+    """
+    missing = {name: _column_bytes(name) for name in vis}
+    for name, count in missing.items():
+        _check_space(name, count)
+    before = {name: (set(os.listdir(name)), Path(name, "table.dat").read_bytes()) for name in vis if missing[name]}
+    with signals_deferred():
+        if any(map(_held_open, vis)):
+            write(**request)
+            return
+        try:
+            in_child("column", **request)
+        except ChildError as error:
+            full = any(shutil.disk_usage(name).free < _OVERHEAD for name in vis)
+            for name, state in before.items():
+                _clear_away(name, *state)
+            left = incomplete_columns(vis)
+            states = f"{_COLUMN} of {', '.join(left)} is incomplete; restart=True, niter=0 finishes it" if left \
+                else "the MeasurementSets are as they were"
+            words = f"savemodel = 'modelcolumn': {_COLUMN} could not be written"
+            if full:
+                raise OSError(errno.ENOSPC, f"{words}, the disk is full: {error}; {states}") from error
+            raise RuntimeError(f"{words}: {error}; {states}") from error
+
+
+def _clear_away(name, files, description):
+    """Remove what is left of a column that was not added."""
+    if Path(name, "table.dat").read_bytes() == description:
+        for file in set(os.listdir(name)) - files:
+            if file.startswith("table.") or file == INCOMPLETE:
+                os.unlink(os.path.join(name, file))
+
+
+def _held_open(name):
+    """Return whether this process has files of a MeasurementSet open, as far as the system tells."""
+    folder, files = os.path.realpath(name) + os.sep, "/proc/self/fd"
+    opened_files = os.listdir(files) if os.path.isdir(files) else ()
+    return any(os.path.realpath(os.path.join(files, file)).startswith(folder) for file in opened_files)
 
 
 def _pieces(ms):
@@ -172,21 +259,3 @@ def _read_back(ms):
 def _checksum(values):
     """Return the CRC of complex values in the column's single precision."""
     return zlib.crc32(np.asfortranarray(values, dtype=np.complex64).tobytes(order="F"))
-
-
-@contextmanager
-def _signals_deferred():
-    """Hold back SIGINT and SIGTERM, and deliver them at the end. Only the main thread can."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    received = []
-    deferred = (signal.SIGINT, signal.SIGTERM)
-    before = {number: signal.signal(number, lambda *got: received.append(got[0])) for number in deferred}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-        for number in received:
-            signal.raise_signal(number)

@@ -1,4 +1,11 @@
-"""What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, and the record .sara.json."""
+"""What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, and the record .sara.json.
+
+They appear together. They are written in `.<name>.new`, beside their places; when all are complete and on the disk, the
+folder is renamed `.<name>.whole`, and from then on they are the products: the older ones go to `.<name>.old`, the
+folder becomes `.<name>.moving`, its contents go to their places, and `.<name>.old` is removed. A run that is killed
+leaves one of these folders, and the next one under this name goes by it: `.new` is thrown away, `.whole` and `.moving`
+are followed to the end. No name of another run can give one of these folders.
+"""
 
 from __future__ import annotations
 
@@ -6,22 +13,27 @@ import errno
 import math
 import os
 import shutil
-import tempfile
 from contextlib import contextmanager
 
 import numpy as np
 
+from casa_sara import jsonfile
+from casa_sara.casa.child import ChildError, in_child
+from casa_sara.casa.imageplane import ImagePlane
 from casa_sara.casa.images import write_image
 from casa_sara.casa.restore import restore
 from casa_sara.casa.tools import opened
+from casa_sara.interrupt import signals_deferred
 
 __all__ = [
-    "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products", "remove_products",
-    "write_products",
+    "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
+    "recover_products",
+    "remove_products", "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-RECORD, REPORT = ".sara.json", ".report"  # written last, by the task; the report is a folder
+CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
+RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
 
 
 def existing_products(imagename):
@@ -51,40 +63,84 @@ def check_imagename(imagename, shape):
         raise FileNotFoundError(f"imagename = '{imagename}': the folder '{folder}' does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise PermissionError(f"imagename = '{imagename}': the folder '{folder}' cannot be written to")
-    needed = (len(PRODUCTS) * 4 + 3) * math.prod(shape) + 2_000_000
-    free = shutil.disk_usage(folder).free
+    needed, free = _bytes_needed(shape), shutil.disk_usage(folder).free
     if free < needed:
-        space = f"the images take {needed / 1e6:.0f} MB, '{folder}' has {free / 1e6:.0f} MB left"
-        raise OSError(errno.ENOSPC, f"imagename = '{imagename}', imsize = {list(shape)}: {space}")
+        space = f"the images take {needed / 1e6:.1f} MB, '{folder}' has {free / 1e6:.1f} MB left"
+        raise OSError(errno.ENOSPC, f"imagename = '{imagename}', imsize = {list(shape)}: {space}; free some, or choose "
+                                    "another folder")
+
+
+def _bytes_needed(shape):
+    """Return the size of all products: pixels, masks, and what is around them."""
+    return (len(PRODUCTS) * 4 + 3) * math.prod(shape) + 2_000_000
+
+
+def _folder_of(imagename, stage):
+    """Return the folder of one stage: '.new', '.whole', '.moving' or '.old'."""
+    folder, base = os.path.split(imagename)
+    return os.path.join(folder, f".{base}{stage}")
 
 
 @contextmanager
 def new_products(imagename):
-    """Yield the name under which to write the products; they take their place when all are complete.
+    """Yield the name under which to write the products; they take their places when all are complete.
 
-    They are written in a temporary folder beside `imagename`. At the end those of an older
-    run are replaced, all together; when something fails, everything stays as it was.
+    Those of an older run are replaced, all together; when something fails, everything stays as it was. The folder
+    of the report, where others may have put files, is left to who writes reports.
     """
-    folder, base = os.path.split(imagename)
-    scratch = tempfile.mkdtemp(prefix=f".{base}.", dir=folder or ".")
+    recover_products(imagename)
+    new = _folder_of(imagename, ".new")
+    os.mkdir(new)
     try:
-        yield os.path.join(scratch, base)
-        written = os.listdir(scratch)
-        replaced = tempfile.mkdtemp(dir=scratch)
+        yield os.path.join(new, os.path.basename(imagename))
+    except BaseException:
+        shutil.rmtree(new, ignore_errors=True)
+        raise
+    with signals_deferred():
+        os.rename(new, _folder_of(imagename, ".whole"))
+        _take_places(imagename)
+
+
+def recover_products(imagename):
+    """Finish, or clear away, what a run under this name left that was killed while it wrote its products."""
+    shutil.rmtree(_folder_of(imagename, ".new"), ignore_errors=True)
+    _take_places(imagename)
+
+
+def _take_places(imagename):
+    """Replace the products by those in '.whole', or go on with it."""
+    whole, moving, old = (_folder_of(imagename, stage) for stage in (".whole", ".moving", ".old"))
+    if os.path.isdir(whole):  # what stands under the name is older
+        os.makedirs(old, exist_ok=True)
         for path in existing_products(imagename):
-            os.rename(path, os.path.join(replaced, os.path.basename(path)))
-        for name in written:
-            os.rename(os.path.join(scratch, name), os.path.join(folder, name))
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+            if not path.endswith(REPORT):
+                os.rename(path, os.path.join(old, os.path.basename(path)))
+        os.rename(whole, moving)
+    if os.path.isdir(moving):
+        for name in os.listdir(moving):
+            os.rename(os.path.join(moving, name), os.path.join(os.path.dirname(imagename), name))
+        os.rmdir(moving)
+    shutil.rmtree(old, ignore_errors=True)
 
 
-def write_products(imagename, plane, images, sumwt, beam, restoringbeam=None, history=()):
+def _sync(folder):
+    """Bring files and folders to the disk, so that a power failure does not undo the order of events."""
+    for parent, _, names in os.walk(folder):
+        for path in [parent, *(os.path.join(parent, name) for name in names)]:
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+
+
+def write_products(output, plane, images, sumwt, beam, record=None):
     """Write the products of a run, as tclean does.
 
     Parameters
     ----------
-    imagename : str
+    output : casa_sara.options.Output
+        Its `imagename`, `restoringbeam` and `history`, lines for the history of every image.
     plane : ImagePlane
     images : dict of float32 (nx, ny)
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
@@ -92,22 +148,50 @@ def write_products(imagename, plane, images, sumwt, beam, restoringbeam=None, hi
     sumwt : float
     beam : dict
         Of `restore.fit_beam`.
-    restoringbeam : str or sequence, optional
-        As tclean's; None leaves out the restored image.
-    history : sequence of str
-        Lines for the history of every image.
+    record : dict, optional
+        Kept as `RECORD`.
+
+    Raises
+    ------
+    OSError
+        The images could not be written, as on a full disk; everything is as it was before.
     """
-    with new_products(imagename) as root:
-        write_image(root + ".psf", images["psf"], plane, beam=beam)
-        write_image(root + ".residual", images["residual"], plane, masked=True)
-        write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
-        write_image(root + ".pb", plane.pb, plane, masked=True)
-        write_image(root + ".sumwt", np.array([[sumwt]], np.float32), plane)
-        if restoringbeam is not None:
-            restore(root, restoringbeam)
-        for path in existing_products(root):
-            with opened("image", path) as ia:
-                ia.sethistory(origin="tsara", history=list(history))
+    check_imagename(output.imagename, plane.shape)  # the disk may have filled up since the run began
+    with new_products(output.imagename) as root:
+        try:
+            in_child("products", root=root, plane=vars(plane), images=images, sumwt=float(sumwt), beam=beam,
+                     restoringbeam=output.restoringbeam, history=output.history)
+            if record is not None:
+                jsonfile.save(root + RECORD, record)
+            _sync(os.path.dirname(root))
+        except (ChildError, OSError) as error:
+            raise _not_written(output.imagename, plane.shape, os.path.dirname(root), error) from error
+
+
+def write_images(root, plane, images, sumwt, beam, restoringbeam, history):
+    """Write the images under the name `root`: what `write_products` has a child process do."""
+    plane = ImagePlane(**plane)
+    write_image(root + ".psf", images["psf"], plane, beam=beam)
+    write_image(root + ".residual", images["residual"], plane, masked=True)
+    write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
+    write_image(root + ".pb", plane.pb, plane, masked=True)
+    write_image(root + ".sumwt", np.array([[sumwt]], np.float32), plane)
+    if restoringbeam is not None:
+        restore(root, restoringbeam)
+    for path in existing_products(root):
+        with opened("image", path) as ia:
+            ia.sethistory(origin="tsara", history=list(history))
+
+
+def _not_written(imagename, shape, scratch, error):
+    """Return the error that says why the images were not written: a full disk, or in CASA's words."""
+    folder, needed, free = os.path.dirname(imagename) or ".", _bytes_needed(shape), shutil.disk_usage(scratch).free
+    written = sum(os.lstat(os.path.join(parent, name)).st_blocks * 512
+                  for parent, _, names in os.walk(scratch) for name in names)
+    if free + written < needed:
+        return OSError(errno.ENOSPC, f"imagename = '{imagename}': '{folder}' filled up while the images were written: "
+                       f"of {needed / 1e6:.1f} MB they had {written / 1e6:.1f} MB, and {free / 1e6:.1f} MB are left")
+    return OSError(errno.EIO, f"imagename = '{imagename}': the images could not be written in '{folder}': {error}")
 
 
 def history_lines(taskname, parameters):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-__all__ = ["check_frequency", "radians"]
+import math
+
+__all__ = ["check_frequency", "radians", "seconds"]
 
 
 def radians(text, parameter):
@@ -18,6 +20,25 @@ def radians(text, parameter):
     import casatools
 
     return casatools.quanta().convert(text, "rad")["value"]
+
+
+def seconds(text, parameter):
+    """Return the time span `text`, as '90min' or '2h', in seconds.
+
+    Raises
+    ------
+    ValueError
+        It is not a positive, finite time; the message names `parameter`.
+    """
+    value = 0.0
+    if _is(text, "s"):
+        import casatools
+
+        value = casatools.quanta().convert(text, "s")["value"]
+    if not 0 < value < math.inf:
+        right = "a positive number with its unit, as '2h' or '90min'"
+        raise ValueError(f"{parameter} = '{text}' is not a time: it takes {right}")
+    return value
 
 
 def check_frequency(text, parameter):

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
 
 from casa_sara.casa.images import write_image
 from casa_sara.casa.quantities import radians
-from casa_sara.casa.tools import opened
+from casa_sara.casa.tools import opened, scratch_folder
 
 __all__ = ["fit_beam", "restore", "restoring_beam_words"]
 
@@ -36,7 +35,7 @@ def fit_beam(psf, plane):
     import casatools
 
     utils = casatools.synthesisutils()
-    with tempfile.TemporaryDirectory(prefix="casa_sara_") as folder:
+    with scratch_folder(psf.shape) as folder:
         root = os.path.join(folder, "beam")
         write_image(root + ".psf", psf, plane)
         try:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import math
+import shutil
+import tempfile
 from contextlib import contextmanager
 
-__all__ = ["opened"]
+__all__ = ["opened", "scratch_folder"]
 
 
 @contextmanager
@@ -18,3 +22,20 @@ def opened(tool_name, *args, **options):
         yield tool
     finally:
         tool.close()
+
+
+@contextmanager
+def scratch_folder(shape):
+    """Yield a temporary folder with room for images of this shape: CASA ends the process where there is none.
+
+    Raises
+    ------
+    OSError
+        The disk of temporary files has too little space left.
+    """
+    with tempfile.TemporaryDirectory(prefix="casa_sara_") as folder:
+        needed, free = 10 * math.prod(shape) + 2_000_000, shutil.disk_usage(folder).free
+        if free < needed:
+            raise OSError(errno.ENOSPC, f"the folder of temporary files, '{tempfile.gettempdir()}', has "
+                          f"{free / 1e6:.1f} MB left, and an image takes {needed / 1e6:.1f} MB: free some, or set TMPDIR to another folder")
+        yield folder

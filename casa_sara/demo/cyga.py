@@ -21,6 +21,8 @@ REGIONS = (
     "core = 19h59m28.356s 40d44m02.10s 0.25arcsec", "companion = 19h59m28.327s 40d44m01.874s 0.12arcsec",
     "western hotspots = 19h59m27.39s 40d44m05.4s 1.6arcsec",
 )
+INJECTED = "19h59m28.356s 40d44m06.6s"  # between the lobes
+COARSER = 1.5  # pixels of the first frame of the animation
 SEED = 1
 # the best SNR of a grid over scales, bias, gain and mask, for each weighting; more iterations do not raise it
 COMMON = {"gain": 0.2, "niter": 4000, "nsigma": 2.0}
@@ -47,8 +49,18 @@ def run(folder: Path) -> None:
     write_truth(simulation, folder)
     print("\n" + table(simulation.truth, products, simulation.cell_arcsec))
     picture(folder / "cyga.png", simulation, products, samples)
-    text, page = write_comparison(case, str(folder / "truth.model"), REGIONS)
+    print("  tsara with coarser pixels, and again without and with a point source injected …", flush=True)
+    run_tsara(_coarser(case), "tsara_coarser")
+    frames = tuple(str(folder / name) for name in ("tsara_coarser", "tsara"))
+    text, page = write_comparison(case, truth=str(folder / "truth.model"), regions=REGIONS, frames=frames,
+                                  inject=(INJECTED,))
     print(f"\n{text}\n\n  report: {page}")
+
+
+def _coarser(case: Case) -> Case:
+    """Return the same field on coarser pixels."""
+    imsize = [2 * round(n / COARSER / 2) for n in case.imsize]
+    return Case(case.folder, case.vis, imsize, COARSER * case.cell_arcsec)
 
 
 def table(truth: np.ndarray, products: list[Product], cell_arcsec: float) -> str:

@@ -59,12 +59,12 @@ class Product:
     cpu_s: float
 
 
-def run_tsara(case: Case) -> Product:
-    """Image a case with tsara; its restored and residual images are weighted as tclean's with Briggs −1."""
+def run_tsara(case: Case, name: str = "tsara") -> Product:
+    """Image a case with tsara under a name; restored and residual images are weighted as tclean's with Briggs −1."""
     wall, cpu = time.perf_counter(), time.process_time()
-    made = tsara(**case.common("tsara"), weighting="briggs", robust=-1.0)
+    made = tsara(**case.common(name), weighting="briggs", robust=-1.0)
     times = time.perf_counter() - wall, time.process_time() - cpu
-    return _product("tsara", case.folder / "tsara", made["iterdone"], *times)
+    return _product(name, case.folder / name, made["iterdone"], *times)
 
 
 def run_tcleans(case: Case) -> list[Product]:
@@ -81,15 +81,19 @@ def run_tcleans(case: Case) -> list[Product]:
     return [_product(name, *result) for name, result in zip(TCLEAN_WEIGHTINGS, made)]
 
 
-def write_comparison(case: Case, truth: str = "", regions: tuple[str, ...] = ()) -> tuple[str, Path]:
-    """Compare the three products of a case as the task saracompare does; return its tables as text, and the report."""
+def write_comparison(case: Case, **more) -> tuple[str, Path]:
+    """Compare the three products of a case as the task saracompare does; return its tables as text, and the report.
+
+    `more` is the rest of `casa_sara.options.Comparing`.
+    """
     from casa_sara.analysis.report import write_report
     from casa_sara.analysis.tables import as_text
     from casa_sara.compare import compare_images
     from casa_sara.options import Comparing, Selection
+    from casa_sara.resources import available_cores
 
     roots = tuple(str(case.folder / name) for name in ("tsara", "tclean_briggs", "tclean_natural"))
-    request = Comparing(roots, ("tsara", *TCLEAN_WEIGHTINGS), truth, regions)
+    request = Comparing(roots, ("tsara", *TCLEAN_WEIGHTINGS), **more, nthreads=available_cores())
     with quiet(case.folder / "comparison.txt"):
         comparison = compare_images(request, Selection(tuple(case.vis), datacolumn="data"))
         page = write_report(comparison, case.folder / "report", f"tsara beside tclean: {case.folder.name}")

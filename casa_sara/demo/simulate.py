@@ -16,7 +16,7 @@ from casatools import ctsys, measures, simulator, table
 from casa_sara.demo.predict import predict
 from casa_sara.demo.sky import ARCSEC, Sky
 
-__all__ = ["Block", "Observation", "Simulation", "antennas", "simulate_observation"]
+__all__ = ["Block", "Observation", "Simulation", "antennas", "gain_errors", "simulate_observation"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 
@@ -181,9 +181,8 @@ class _Rows:
 
     def corrupt(self, noise_std: float, weight_scale: float, gain_rms: float, seed: list[int]) -> list[Block]:
         """Write visibilities with gain errors and noise, SIGMA and WEIGHT; return what each scan got."""
-        gain = np.random.default_rng([*seed, 1])
         shape = self.scan.max() + 1, max(a.max() for a in self.antennas) + 1
-        gains = (1 + gain_rms * gain.standard_normal(shape)) * np.exp(1j * gain_rms * gain.standard_normal(shape))
+        gains = gain_errors(gain_rms, shape, seed)
         first, second = (gains[self.scan, antenna] for antenna in self.antennas)
         gain_error = self.signal * (first * second.conj() - 1)
         pointing = np.random.default_rng([*seed, 3])
@@ -210,6 +209,12 @@ class _Rows:
             signal = float(np.sqrt(2 * weight) * np.linalg.norm(self.signal[:, of]))
             blocks.append(Block(str(self.vis), int(scan), int(of.sum()) * self.signal.shape[0], signal, *norms))
         return blocks
+
+
+def gain_errors(gain_rms: float, shape: tuple[int, int], seed: list[int]) -> np.ndarray:
+    """Return the gains, complex (scan, antenna), of a MeasurementSet; `seed`: the observation's, its own number."""
+    gain = np.random.default_rng([*seed, 1])
+    return (1 + gain_rms * gain.standard_normal(shape)) * np.exp(1j * gain_rms * gain.standard_normal(shape))
 
 
 def _tilted(sky: Sky) -> list[Sky]:

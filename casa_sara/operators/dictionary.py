@@ -19,7 +19,7 @@ from casa_sara.operators._wavelet_weights import RING_ROWS, neighbourhood_weight
 from casa_sara.operators._workers import Workers
 from casa_sara.options import SARA_BASES
 
-__all__ = ["Band", "SaraDictionary"]
+__all__ = ["Band", "SaraDictionary", "coefficient_bytes"]
 
 CACHE_LINE = 64
 ORIENTATIONS = ("aa", "ad", "da", "dd")
@@ -73,8 +73,7 @@ class SaraDictionary:
         self.levels, self.dtype = int(levels), np.dtype(dtype)
         self._validate()
         self.n_bases = len(self.wavelets)
-        block = 1 << self.levels
-        padded = tuple(-(-n // block) * block for n in self.shape)
+        padded = _padded(self.shape, self.levels)
         self.coef_shape = (self.n_bases, *padded)
         self.n_coefs = self.n_bases * padded[0] * padded[1]
         self._filters = _filters(self.wavelets, self.dtype)
@@ -97,7 +96,7 @@ class SaraDictionary:
     def _workspaces(self):
         nx, ny = self.coef_shape[1:]
         size, threads = self.dtype.itemsize, self._workers.count
-        approx = sum((nx >> level) * kernels.padded_width(ny >> level, size) for level in range(1, self.levels))
+        approx = _approximations((nx, ny), self.levels, size)
         width = kernels.padded_width(ny + 2 * kernels.HALO, size)
         return kernels.Work(
             levels=self.levels, approx=_aligned((self.n_bases, approx), self.dtype),
@@ -216,6 +215,24 @@ class SaraDictionary:
         image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
         self._workers.run(kernels.analyse_finest, image, job)
         self._workers.run(kernels.transform_deeper, job, True, back)
+
+
+def _padded(shape, levels):
+    """The next multiples of 2**levels."""
+    block = 1 << levels
+    return tuple(-(-n // block) * block for n in shape)
+
+
+def _approximations(padded, levels, itemsize):
+    """Pixels of the approximations of one basis."""
+    nx, ny = padded
+    return sum((nx >> level) * kernels.padded_width(ny >> level, itemsize) for level in range(1, levels))
+
+
+def coefficient_bytes(shape, n_bases, levels, dtype=np.float32):
+    """Memory of one array of coefficients, and of the workspace of a dictionary, in bytes."""
+    padded, size = _padded(shape, levels), np.dtype(dtype).itemsize
+    return n_bases * padded[0] * padded[1] * size, n_bases * _approximations(padded, levels, size) * size
 
 
 def _rectangle(band):

@@ -20,9 +20,9 @@ import numpy as np
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.decimation import (
     AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable)
-from casa_sara.operators.nufft import NonUniformFFT
+from casa_sara.operators.nufft import NonUniformFFT, memory_size
 
-__all__ = ["MeasurementOperator", "check_cell", "choose_eps"]
+__all__ = ["MeasurementOperator", "check_cell", "check_field", "choose_eps", "grid_bytes"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 SMALLEST_EPS = {np.dtype(np.float32): 1e-6, np.dtype(np.float64): 1e-13}
@@ -74,18 +74,22 @@ class MeasurementOperator:
             raise ValueError(f"row_scale must have shape ({self.size},), not {row_scale.shape}")
         self._workers = Workers(nthreads)
         frequencies = _cycles_per_pixel(uv, cell_rad)
-        sign = np.where(frequencies[1] < 0, -1.0, 1.0)  # V(−u, −v) is the conjugate of V(u, v)
-        self._plan(frequencies * sign, np.stack([row_scale, row_scale * sign], axis=1), eps / 2)
+        scales = np.stack([row_scale, row_scale], axis=1, dtype=self.dtype, casting="same_kind")
+        lower = frequencies[1] < 0  # V(−u, −v) is the conjugate of V(u, v)
+        np.negative(frequencies, out=frequencies, where=lower)
+        np.negative(scales[:, 1], out=scales[:, 1], where=lower)
+        self._plan(frequencies, scales, eps / 2)
 
     def _plan(self, frequencies, scales, eps):
-        """Decimation along both axes, then the transform of what it leaves."""
-        reach, precision = np.abs(frequencies[0]).max(), np.finfo(self.dtype).eps
-        axes = [AxisDecimation(self.shape[0], (-reach, reach), eps, precision),
-                AxisDecimation(self.shape[1], (0.0, frequencies[1].max()), eps, precision)]
-        response = axes[0].response(frequencies[0]) * axes[1].response(frequencies[1])
-        inner = np.stack([axis.factor * (f - axis.centre) for axis, f in zip(axes, frequencies)])
+        """Decimation along both axes, then the transform of what it leaves; `frequencies` and `scales` are used up."""
+        axes = _decimations(self.shape, np.abs([frequencies.min(axis=1), frequencies.max(axis=1)]).max(axis=0), eps,
+                            self.dtype)
+        for axis, frequency in zip(axes, frequencies):
+            scales /= axis.response(frequency)[:, None]
+            frequency -= axis.centre
+            frequency *= axis.factor
         starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
-        self._nufft = NonUniformFFT(inner, scales / response[:, None], starts, counts, eps, self.dtype, self._workers)
+        self._nufft = NonUniformFFT(frequencies, scales, starts, counts, eps, self.dtype, self._workers)
         self._rows, self._columns = (
             separable(axis, size, cells, factors, self.complex_dtype)
             for axis, size, (cells, factors) in zip(axes, self.shape, self._nufft.placement))
@@ -121,17 +125,54 @@ def check_cell(uv, cell_rad):
     cell = np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))
     if not np.all(cell > 0):
         raise ValueError(f"cell={cell_rad} must be positive, in radians")
-    longest = np.abs(uv).max(axis=1)
+    longest = np.maximum(uv.max(axis=1), -uv.min(axis=1))
     if np.any(longest * cell > 0.5):
         largest = 0.5 / longest.max() * ARCSEC_PER_RAD
         raise ValueError(f"cell={cell.max() * ARCSEC_PER_RAD:.4g}arcsec is too large for the longest baseline, "
                          f"{longest.max() / 1e3:.4g} klambda: use at most cell={0.999 * largest:.4g}arcsec")
 
 
+def check_field(longest, shape, cell_rad):
+    """Raise ValueError unless the image is as wide as the fringe of the longest baseline, in wavelengths."""
+    width = min(n * cell for n, cell in zip(shape, cell_rad))
+    if width * longest < 1:
+        cells = [f"{cell * ARCSEC_PER_RAD:.4g}arcsec" for cell in cell_rad]
+        raise ValueError(f"imsize = {list(shape)} with cell = {cells} is an image {width * ARCSEC_PER_RAD:.3g} arcsec "
+                         f"wide: should hold the finest fringe at least, {ARCSEC_PER_RAD / longest:.3g} arcsec")
+
+
+def _decimations(shape, reach, eps, dtype):
+    """Decimation of both axes for |f| ≤ reach, in cycles per pixel; along columns f ≥ 0."""
+    bands, precision = ((-reach[0], reach[0]), (0.0, reach[1])), np.finfo(dtype).eps
+    return [AxisDecimation(size, band, eps, precision) for size, band in zip(shape, bands)]
+
+
+def grid_bytes(size, reach, shape, eps=1e-6, dtype=np.float32):
+    """Memory of an operator but for what it keeps of each visibility: its grid, and the decimated image.
+
+    Parameters
+    ----------
+    size : int
+        Number of visibilities M.
+    reach : (float, float)
+        Largest |u|·cell and |v|·cell, in cycles per pixel.
+    shape, eps, dtype
+        As of the operator.
+
+    Returns
+    -------
+    int
+    """
+    axes = _decimations(shape, reach, eps / 2, np.dtype(dtype))
+    starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
+    cells = memory_size(size, starts, counts, eps / 2, dtype)
+    return np.dtype(dtype).itemsize * (cells + counts[0] * shape[1])
+
+
 def _cycles_per_pixel(uv, cell_rad):
     """Baselines (2, M) as frequencies along the image axes."""
     check_cell(uv, cell_rad)
-    return uv * np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))[:, None] * [[-1.0], [1.0]]
+    return uv * (np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))[:, None] * [[-1.0], [1.0]])
 
 
 def _checked(array, name, shape, dtype):

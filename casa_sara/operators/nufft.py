@@ -10,7 +10,9 @@ transformed, and interpolated with the kernel at (f_m, g_m).  Its aliases set th
 width of the kernel and padding are chosen for the least work at the accuracy asked for.
 
 Cell numbers and fractions of a cell are kept apart, so that in single precision the error
-does not grow with the size of the image.  All memory is allocated once.
+does not grow with the size of the image.  All memory is allocated once.  The points are spread to the grid in
+pieces whose number depends on that of the points alone, so that results are the same, to the last bit, for any number
+of threads.
 """
 
 from __future__ import annotations
@@ -25,9 +27,10 @@ from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import (
     gather_rows, multiply, pair_sums, polynomials, scale_pairs, scatter_rows)
 
-__all__ = ["NonUniformFFT"]
+__all__ = ["NonUniformFFT", "memory_size"]
 
 TILE_ROWS = 16
+MOST_PIECES, PIECE_POINTS = 16, 5000
 MAX_COLUMN_FREQUENCY = 0.42
 
 
@@ -58,38 +61,42 @@ class NonUniformFFT:
         beta = kaiser_bessel.kernel_shape(width, sigma)
         self._kernel = _kernel(width, beta, dtype)
         self._halo = width // 2 + 1
-        self._stride = 2 * (self._lengths[1] + 4)  # in reals; rows of 2^k cells would share cache lines
+        self._stride = _stride(self._lengths)
         self._place_points(frequencies, scales, width, dtype)
         self._allocate(width, dtype)
         self._place_samples(starts, counts, width, beta)
 
     def _place_points(self, frequencies, scales, width, dtype):
         """Sort the points by rows of tiles and share them out."""
-        place = (frequencies + 0.5) * np.array(self._lengths)[:, None] - width / 2
+        place = frequencies + 0.5
+        place *= np.array(self._lengths)[:, None]
+        place -= width / 2
         place[0] += self._halo
-        row, column = first = np.ceil(place).astype(np.int64)
+        row, column = cells = np.ceil(place).astype(np.int32)
+        place -= cells  # −1 … 0
         order = np.argsort(row // TILE_ROWS, kind="stable")
+        first = row[order] * np.int64(self._stride)
+        first += 2 * column[order]
         self._points = Points(
-            first=(row * self._stride + 2 * column)[order],
-            within=(1 - 2 * (first - place)).T[order].astype(dtype, order="C"),
-            scales=scales[order].astype(dtype),
+            first=first,
+            within=np.ascontiguousarray((1 + 2 * place.astype(dtype)).T[order]),
+            scales=scales[order].astype(dtype, copy=False),
             order=order.astype(np.int32),
-            shares=np.linspace(0, order.size, self._workers.count + 1).astype(np.int64))
+            shares=np.linspace(0, order.size, _pieces(order.size) + 1).astype(np.int64))
         self._used = slice(column.min(), column.max() + len(self._kernel.lanes) // 2)
 
     def _allocate(self, width, dtype):
-        """The grid and, for each worker but the first, a private piece of it to spread to."""
+        """The grid and, for each share of the points but the first, a piece of it to spread to."""
         height, shares = self._lengths[0] + 2 * self._halo, self._points.shares
         rows, end = self._points.first // self._stride, height * self._stride
-        self._pieces = np.zeros((self._workers.count, 3), np.int64)  # first row, last row + 1, distance from the grid
-        for worker, (low, high) in enumerate(zip(shares[1:-1], shares[2:]), start=1):
-            if high > low:
-                top, bottom = rows[low:high].min(), rows[low:high].max() + width
-                self._pieces[worker] = top, bottom, end - top * self._stride
-                end += (bottom - top) * self._stride
+        self._pieces = np.zeros((len(shares) - 1, 3), np.int64)  # first row, last row + 1, distance from the grid
+        for piece, (low, high) in enumerate(zip(shares[1:-1], shares[2:]), start=1):
+            top, bottom = rows[low:high].min(), rows[low:high].max() + width
+            self._pieces[piece] = top, bottom, end - top * self._stride
+            end += (bottom - top) * self._stride
         self._memory = np.zeros(end, dtype)
-        cells = self._memory[: height * self._stride].view(np.result_type(dtype, np.complex64))
-        self.grid = cells.reshape(height, -1)[:, : self._lengths[1]]
+        self._cells = self._memory[: height * self._stride]
+        self.grid = self._cells.view(np.result_type(dtype, np.complex64)).reshape(height, -1)[:, : self._lengths[1]]
 
     def _place_samples(self, starts, counts, width, beta):
         """Where samples go in the grid, and their factors; (−1)^i moves frequency 0 to its middle."""
@@ -103,7 +110,7 @@ class NonUniformFFT:
 
     def clear(self):
         """Fill the grid with zeros."""
-        self._workers.run(_clear, self._memory)
+        self._workers.run(_clear, self._cells)
 
     def to_points(self, out):
         """Transform the samples in `grid` into `out`, contiguous complex (M,)."""
@@ -143,7 +150,7 @@ class Points(NamedTuple):
     within: np.ndarray  # real (M, 2), place in that cell, −1 … 1
     scales: np.ndarray  # real (M, 2)
     order: np.ndarray  # int32 (M,), number of the point before sorting
-    shares: np.ndarray  # int64 (workers + 1,), the points of each worker
+    shares: np.ndarray  # int64 (pieces + 1,), the points of each piece
 
 
 class Kernel(NamedTuple):
@@ -164,6 +171,24 @@ def _kernel(width, beta, dtype):
 
 def _lanes(width):
     return 16 if width <= 8 else 32
+
+
+def _stride(lengths):
+    """Distance of rows in reals; rows of 2^k cells would share cache lines."""
+    return 2 * (lengths[1] + 4)
+
+
+def _pieces(n_points):
+    """Number of pieces that the points are spread in."""
+    return int(min(MOST_PIECES, max(1, n_points // PIECE_POINTS)))
+
+
+def memory_size(n_points, starts, counts, eps, dtype):
+    """Number of reals in the grid and the pieces, at most: these hold disjoint tiles of the rows, but for a halo each."""
+    width, _, lengths = _least_work(n_points, starts, counts, eps, dtype)
+    height = lengths[0] + 2 * (width // 2 + 1)
+    more = _pieces(n_points) - 1
+    return (height + min(more, 1) * height + more * (width + TILE_ROWS)) * _stride(lengths)
 
 
 def _real_pairs(values):
@@ -203,7 +228,7 @@ def _clear(memory, worker, workers):
 @_jit
 def _interpolate(cells, stride, points, kernel, values, worker, workers):
     """values[point] = scales · Σ_rows kernel_0 Σ_columns kernel_1 · cells."""
-    for p in range(points.shares[worker], points.shares[worker + 1]):
+    for p in range(points.order.size * worker // workers, points.order.size * (worker + 1) // workers):
         down = polynomials(kernel.coefs, points.within[p, 0], kernel.terms, kernel.lanes)
         along = polynomials(kernel.coefs, points.within[p, 1], kernel.terms, kernel.lanes)
         real, imag = pair_sums(multiply(gather_rows(cells, points.first[p], stride, down, kernel.width), along))
@@ -213,18 +238,21 @@ def _interpolate(cells, stride, points, kernel, values, worker, workers):
 
 @_jit
 def _spread(cells, stride, points, kernel, pieces, values, worker, workers):
-    """Transpose of `_interpolate`, each worker into its piece."""
-    for p in range(points.shares[worker], points.shares[worker + 1]):
-        q = points.order[p]
-        down = polynomials(kernel.coefs, points.within[p, 0], kernel.terms, kernel.lanes)
-        along = polynomials(kernel.coefs, points.within[p, 1], kernel.terms, kernel.lanes)
-        row = scale_pairs(along, points.scales[p, 0] * values[q, 0], points.scales[p, 1] * values[q, 1])
-        scatter_rows(cells, points.first[p] + pieces[worker, 2], stride, down, row, kernel.width)
+    """Transpose of `_interpolate`, each share of the points into its piece; the first is the grid, which is clear."""
+    for piece in range(worker, len(pieces), workers):
+        offset = pieces[piece, 2]
+        cells[pieces[piece, 0] * stride + offset : pieces[piece, 1] * stride + offset] = 0
+        for p in range(points.shares[piece], points.shares[piece + 1]):
+            q = points.order[p]
+            down = polynomials(kernel.coefs, points.within[p, 0], kernel.terms, kernel.lanes)
+            along = polynomials(kernel.coefs, points.within[p, 1], kernel.terms, kernel.lanes)
+            row = scale_pairs(along, points.scales[p, 0] * values[q, 0], points.scales[p, 1] * values[q, 1])
+            scatter_rows(cells, points.first[p] + offset, stride, down, row, kernel.width)
 
 
 @_jit
 def _add_pieces(memory, stride, pieces, height, worker, workers):
-    """Add the private pieces to the grid, each worker some rows."""
+    """Add the pieces to the grid, each worker some rows."""
     low, high = height * worker // workers, height * (worker + 1) // workers
     for piece in range(1, len(pieces)):
         for cell in range(max(low, pieces[piece, 0]) * stride, min(high, pieces[piece, 1]) * stride):

@@ -63,6 +63,7 @@ def _sara(result, options, full):
         "notes": list(data.notes),
         "blocks": [_block(result, j) for j in range(len(result.blocks))],
         "nthreads": options.nthreads,
+        "forecast": dict(result.forecast),
     }
     if solved:
         record = solved.record
@@ -73,6 +74,7 @@ def _sara(result, options, full):
             "regscale": options.regscale,
         }
         sara["why"] = dict(WHY)
+        sara["resumed"] = list(record.resumed)
         sara["wild"] = [dict(sample) for sample in solved.wild]
         sara["reweightings"] = [dict(update) for update in record.reweightings]
         sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds} for iteration, bounds in record.bounds]

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import casa_sara
-from casa_sara import jsonfile
 from casa_sara.analysis.comparison import Comparison
+from casa_sara.analysis.folder import MEASURES, PAGE, in_the_way
 from casa_sara.casa import log
 from casa_sara.compare import compare_images
 from casa_sara.options import Comparing, Selection
@@ -18,8 +18,8 @@ from casa_sara.tasks.saracompare import PARAMETERS
 
 __all__ = ["saracompare"]
 
-MEASURES = "measures.json"
-OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust")  # what has no effect without vis
+LISTS = ("models", "names", "regions", "frames", "inject")
+OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust", "inject", "injectflux")  # what has no effect without vis
 
 
 def saracompare(**parameters: Any) -> dict[str, Any]:
@@ -27,13 +27,16 @@ def saracompare(**parameters: Any) -> dict[str, Any]:
     log.info(f"casa_sara {casa_sara.__version__}")
     selection = _selection(parameters)
     folder = _folder(parameters["outdir"], parameters["overwrite"])
-    models, names, regions = (_words(parameters[name]) for name in ("models", "names", "regions"))
+    models, names, regions, frames, inject = (_words(parameters[name]) for name in LISTS)
+    if frames and not folder:
+        raise ValueError(f"frames = {list(frames)} has no effect without outdir: give outdir, the folder of the report")
+    if parameters["injectflux"] and not inject:
+        raise ValueError(f"injectflux = {parameters['injectflux']!r} has no effect without inject: give inject, the "
+                         "places of the sources")
     request = Comparing(models, names, parameters["truth"], regions, parameters["support"], parameters["threshold"],
-                        parameters["robust"], available_cores())
+                        parameters["robust"], frames, inject, parameters["injectflux"], available_cores())
     comparison = compare_images(request, selection)
     if folder:
-        folder.mkdir(exist_ok=True)
-        jsonfile.save(folder / MEASURES, comparison.measures)
         _report(comparison, folder)
     return comparison.measures
 
@@ -61,6 +64,9 @@ def _folder(outdir, overwrite):
     if folder.is_dir() and any(folder.iterdir()) and not overwrite:
         raise FileExistsError(f"outdir = '{outdir}' holds files: choose another folder, or overwrite = True to replace "
                               "an earlier report in it")
+    if taken := in_the_way(folder, (PAGE, MEASURES)):
+        raise FileExistsError(f"outdir = '{outdir}' holds {', '.join(taken)}, not of an earlier report: choose another "
+                              "folder, or move it away")
     if not parent.is_dir():
         raise FileNotFoundError(f"outdir = '{outdir}': the folder '{parent}' does not exist")
     if not os.access(folder if folder.is_dir() else parent, os.W_OK | os.X_OK):
@@ -74,7 +80,7 @@ def _words(value):
 
 
 def _report(comparison: Comparison, folder: Path) -> None:
-    """Write the report and its pictures."""
+    """Write the report, its pictures and the measures."""
     from casa_sara.analysis.report import write_report  # matplotlib takes its time
 
     write_report(comparison, folder)

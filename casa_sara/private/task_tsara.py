@@ -8,15 +8,19 @@ from pathlib import Path
 from typing import Any
 
 import casa_sara
-from casa_sara import jsonfile
+from casa_sara.analysis import folder
 from casa_sara.casa import log
-from casa_sara.casa.modelcolumn import check_model_column_writable
-from casa_sara.casa.products import RECORD, REPORT, check_imagename, existing_products, history_lines
-from casa_sara.casa.quantities import radians
+from casa_sara.casa.lock import one_run_of
+from casa_sara.casa.modelcolumn import check_model_column_writable, incomplete_columns
+from casa_sara.casa.products import (
+    CHECKPOINT, REPORT, check_imagename, existing_products, history_lines, recover_products,
+)
+from casa_sara.casa.quantities import radians, seconds
 from casa_sara.casa.restore import restoring_beam_words
 from casa_sara.imaging import make_image
-from casa_sara.options import Comparing, ImageGrid, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import Comparing, ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
 from casa_sara.private.summary import summary
+from casa_sara.rehearsal import rehearse
 from casa_sara.resources import available_cores
 
 __all__ = ["selection_of", "tsara"]
@@ -32,14 +36,32 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
                           tuple(parameters["uvtaper"]))
     options = _solver_options(parameters)
-    output = _output(parameters, grid)
-    if output.savemodel == "modelcolumn":
-        check_model_column_writable(selection)
-    result = make_image(selection, grid, weighting, options, output)
-    jsonfile.save(output.imagename + RECORD, summary(result, options, full=True)["sara"])
-    if parameters["report"]:
-        _report(output.imagename, selection, options.nthreads)
+    limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
+    if parameters["dryrun"]:
+        return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
+    check_imagename(parameters["imagename"], grid.shape)
+    with one_run_of(parameters["imagename"]):
+        recover_products(parameters["imagename"])
+        output = _output(parameters)
+        if output.savemodel == "modelcolumn":
+            check_model_column_writable(selection)
+        _warn_of_incomplete(selection.vis, output)
+        result = make_image(selection, grid, weighting, options, output,
+                            lambda result: summary(result, options, full=True)["sara"], limits)
+        if parameters["report"]:
+            _report(output.imagename, selection, options.nthreads)
+        elif not output.images_stand:
+            folder.remove(Path(output.imagename + REPORT))  # of older images
     return summary(result, options, parameters["fullsummary"])
+
+
+def _warn_of_incomplete(vis, output):
+    """Point out model columns that a killed run left half written, unless this run writes them."""
+    if output.savemodel == "modelcolumn":
+        return
+    for name in incomplete_columns(vis):
+        log.warn(f"MODEL_DATA of '{name}' is incomplete, a run was killed while it wrote it: calibrate with it only "
+                 "after tsara with restart=True, niter=0, savemodel='modelcolumn' has written it anew")
 
 
 def _report(imagename, selection, nthreads):
@@ -86,6 +108,20 @@ def _cell_rad(value):
     return size
 
 
+def _seconds(maxtime):
+    """The time limit in seconds, a number without unit being minutes; infinite where there is none."""
+    if maxtime == "":
+        return math.inf
+    try:
+        span = float(maxtime) * 60
+    except ValueError:
+        return seconds(maxtime, "maxtime")
+    if not 0 < span < math.inf:
+        raise ValueError(f"maxtime = {maxtime!r}: should be a positive number of minutes, or a time as '2h'; "
+                         "'' sets no limit")
+    return span
+
+
 def _solver_options(parameters):
     if parameters["databound"] == "fixed" and not parameters["l2bound"]:
         raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
@@ -98,21 +134,35 @@ def _solver_options(parameters):
     return SolverOptions(nthreads=nthreads, **values)
 
 
-def _output(parameters, grid):
+def _output(parameters):
     imagename = parameters["imagename"]
     startmodel = parameters["startmodel"]
-    check_imagename(imagename, grid.shape)
-    old = existing_products(imagename)
+    old, checkpoint = existing_products(imagename), imagename + CHECKPOINT
+    images_stand = (parameters["restart"] and parameters["niter"] == 0 and parameters["savemodel"] == "modelcolumn"
+                    and imagename + ".model" in old)
+    unfinished = os.path.lexists(checkpoint) and not images_stand
     if parameters["restart"]:
-        if startmodel:
-            raise ValueError(f"startmodel = '{startmodel}' and restart = True both give the first model: set only one")
-        startmodel = imagename + ".model"
-        if startmodel not in old:
-            raise FileNotFoundError(f"restart = True continues from '{startmodel}', which does not exist: "
-                                    "set restart = False, or give startmodel")
+        if not unfinished:
+            startmodel = _model_to_continue(imagename, startmodel, old)
+    elif unfinished and not parameters["overwrite"]:
+        raise FileExistsError(f"imagename = '{imagename}': a run that has not finished left '{checkpoint}'; choose "
+                              "another name, restart = True to go on from it, or overwrite = True to begin anew")
     elif old and not parameters["overwrite"]:
         raise FileExistsError(f"imagename = '{imagename}': {', '.join(old)} exist; choose another name, "
                               "overwrite = True to replace them, or restart = True to continue from the model")
     beam = tuple(restoring_beam_words(parameters["restoringbeam"])) if parameters["restoration"] else None
-    return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"],
-                  tuple(history_lines("tsara", parameters)))
+    return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"], images_stand,
+                  tuple(history_lines("tsara", parameters)), parameters["restart"] and unfinished)
+
+
+def _model_to_continue(imagename, startmodel, old):
+    """Return the first model of a restart without a checkpoint: the old model, where there is one."""
+    model = imagename + ".model"
+    if model not in old:
+        log.info(f"restart = True: there is neither '{imagename + CHECKPOINT}' nor '{model}': "
+                 "starting from the beginning")
+        return startmodel
+    if startmodel:
+        raise ValueError(f"startmodel = '{startmodel}' and restart = True both give the first model: set only one")
+    log.info(f"restart = True: continuing from '{model}'")
+    return model

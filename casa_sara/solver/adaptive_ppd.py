@@ -6,10 +6,14 @@ import numpy as np
 
 from casa_sara.solver import _kernels as kernels
 from casa_sara.solver.prox import ellipsoid_multiplier
+from casa_sara.solver.statefile import fill
 
 __all__ = ["AdaptivePPD"]
 
 RELAXATION = 1.8
+STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor", "spread",
+                "multipliers", "residual_norms")
+STATE_VALUES = ("threshold", "rel_change", "iteration")
 
 
 class AdaptivePPD:
@@ -154,3 +158,24 @@ class AdaptivePPD:
             self.l2_dual *= self.precond.dtype.type(factor)
             self.multipliers *= factor
         self.threshold = float(threshold)
+
+    def state(self):
+        """Return all that the next step depends on, beside the constructor's arguments.
+
+        Returns
+        -------
+        dict
+            Plain values, and the arrays themselves.
+        """
+        arrays = {name: getattr(self, name) for name in STATE_ARRAYS}
+        return arrays | {name: getattr(self, name) for name in STATE_VALUES} | dict(l2_bounds=self.l2_bounds)
+
+    def set_state(self, state):
+        """Take over what :meth:`state` has returned, by copies."""
+        if self.l1_weights is None:
+            self.l1_weights = self.dictionary.allocate()
+        for name in STATE_ARRAYS:
+            fill(getattr(self, name), state[name])
+        for name in STATE_VALUES:
+            setattr(self, name, state[name])
+        self.l2_bounds = None if state["l2_bounds"] is None else np.array(state["l2_bounds"])

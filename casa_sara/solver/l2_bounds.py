@@ -64,6 +64,7 @@ class _NoiseLevels:
     weight_sums: np.ndarray
     n_bases: int
     regscale: float = 1.0
+    _changing = ("l2_bounds", "weight_sums")
 
     @property
     def noise(self):
@@ -89,6 +90,16 @@ class _NoiseLevels:
         """Hand the multipliers to the iteration, for its current κ."""
         ppd.l2_bounds = None
         ppd.multipliers[:] = ppd.threshold / (ppd.l2_step * self.gradient_noise) * self.noise_weights
+
+    def state(self):
+        """Return what has changed since the start."""
+        return {name: getattr(self, name) for name in self._changing}
+
+    def set_state(self, state):
+        """Take over what :meth:`state` has returned."""
+        for name in self._changing:
+            value = state[name]
+            setattr(self, name, np.array(value) if isinstance(value, np.ndarray) else value)
 
 
 @dataclass
@@ -137,6 +148,7 @@ class AdaptiveBounds(_NoiseLevels):
     min_interval: int = 20
     _last_move: np.ndarray = field(init=False)
     _artefacts: float = field(init=False, default=0.0)
+    _changing = ("l2_bounds", "weight_sums", "_last_move", "_artefacts")
 
     def __post_init__(self):
         self.l2_bounds = np.maximum(self.l2_bounds, self.floor)

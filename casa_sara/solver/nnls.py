@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["nnls"]
+__all__ = ["NNLS_ITERATIONS", "nnls"]
 
 FIRST_PENALTY = 0.5  # of the brightest pixel of the first gradient step
+NNLS_ITERATIONS = 80
+FEWEST_ITERATIONS = 10  # even if there is no time
 PATH = 0.75  # of the iterations, over which the penalty falls
 
 
-def nnls(measurement, vis, precond, data_norm_sq, max_iter=80, last_penalty=1e-3, positivity=True):
+def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last_penalty=1e-3, positivity=True,
+         stopped=lambda: False):
     """Minimise ½‖U^½(y − Φx)‖² + t‖x‖₁ over x ≥ 0 while t falls to almost nothing.
 
     Non-negative least squares alone fills what the data do not see (the flux beyond the shortest baseline
@@ -32,6 +35,8 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=80, last_penalty=1e-3
         Where t ends, relative to where it starts; it stays there for the last quarter of the iterations.
     positivity : bool
         x ≥ 0; else only the penalty, by soft thresholds.
+    stopped : callable
+        Asked after every iteration from the 10th on; True ends the fit with what there is: the brightest sources.
 
     Returns
     -------
@@ -66,6 +71,8 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=80, last_penalty=1e-3
         t_next = 0.5 * (1 + np.sqrt(1 + 4 * t * t))
         momentum = new + dtype.type((t - 1) / t_next) * difference
         model, t = new, t_next
+        if stopped() and iteration + 1 >= FEWEST_ITERATIONS:
+            break
     measurement.forward(model, residual)
     np.subtract(vis, residual, out=residual)
     return model, residual

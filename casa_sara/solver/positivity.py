@@ -7,6 +7,8 @@ the source at the longest baselines.  The lower bound of the pixels is lowered t
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.ndimage import binary_dilation, maximum_filter
 
@@ -30,7 +32,7 @@ class Release:
     """
 
     def __init__(self):
-        self._wanted_before = False
+        self._wanted_before = np.zeros((), bool)
 
     def update(self, ppd, bounds):
         """Release what the residual of the present model asks for.
@@ -54,15 +56,23 @@ class Release:
         before = np.count_nonzero(ppd.lowest)
         lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around)
-        return int(np.count_nonzero(ppd.lowest)) - before
+        return int(np.count_nonzero(ppd.lowest) - before)
+
+    def state(self):
+        """Return what the next call depends on."""
+        return dict(wanted_before=self._wanted_before)
+
+    def set_state(self, state):
+        """Take over what :meth:`state` has returned."""
+        self._wanted_before = np.array(state["wanted_before"])
 
 
 def _wanted(ppd, bounds):
     """Which pixels ask to be released; bool (nx, ny)."""
     weights = ppd.precond * ppd.spread
-    weights *= np.repeat(bounds.noise_weights, np.diff(ppd.offsets)).astype(weights.dtype)
-    pixel = np.zeros_like(ppd.model)
-    pixel[0, 0] = 1
-    noise_sq = ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(pixel))[0, 0]
-    gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)))
-    return (gradient < -SIGNIFICANT * np.sqrt(noise_sq)) & (ppd.model <= ppd.lowest)
+    weights *= np.repeat(bounds.noise_weights.astype(weights.dtype), np.diff(ppd.offsets))
+    image = np.zeros_like(ppd.model)
+    image[0, 0] = 1
+    noise_sq = float(ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(image), image)[0, 0])
+    gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)), image)
+    return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 __all__ = ["CONVERGED", "DIVERGED", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER", "STOP_DESCRIPTIONS",
-           "SolverRecord", "UNFEASIBLE"]
+           "SolverRecord", "TIME_LIMIT", "UNFEASIBLE", "UNFINISHED"]
 
 CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, DIVERGED, UNFEASIBLE = 101, 102, 103, 104, 105, 106
+TIME_LIMIT = 107
 STOP_DESCRIPTIONS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "iteration limit",
@@ -17,7 +18,9 @@ STOP_DESCRIPTIONS = {
     STOPPED_BY_USER: "stopped by user",
     DIVERGED: "diverged",
     UNFEASIBLE: "converged, but the data do not fit the bounds",
+    TIME_LIMIT: "time limit",
 }
+UNFINISHED = (STOPPED_BY_USER, TIME_LIMIT)  # which a restart takes up again
 
 
 @dataclass
@@ -40,6 +43,8 @@ class SolverRecord:
     reweightings : list of dict
         Iteration, scale of the weights, relative change of the model since the one before, and pixels that were then
         allowed to be negative.
+    resumed : list of int
+        The iterations of the checkpoints from which the solution was resumed.
     stop_code : int
         One of the codes of this module.
     """
@@ -52,6 +57,7 @@ class SolverRecord:
     model_max: list[float] = field(default_factory=list)
     bounds: list[tuple[int, np.ndarray]] = field(default_factory=list)
     reweightings: list[dict] = field(default_factory=list)
+    resumed: list[int] = field(default_factory=list)
     stop_code: int = 0
 
     @property
@@ -67,3 +73,14 @@ class SolverRecord:
         self.residual_norm.append(float(np.linalg.norm(ppd.residual_norms)))
         self.model_flux.append(float(ppd.model.sum(dtype=float)) * ppd.unit_jy)
         self.model_max.append(float(ppd.model.max()) * ppd.unit_jy)
+
+    def state(self):
+        """Return the history so far as plain values."""
+        return vars(self) | dict(bounds=[(iteration, bounds.tolist()) for iteration, bounds in self.bounds])
+
+    def set_state(self, state):
+        """Take over what :meth:`state` has returned, and note that the solution was resumed."""
+        for name in vars(self):
+            setattr(self, name, state[name])
+        self.bounds = [(iteration, np.array(bounds)) for iteration, bounds in self.bounds]
+        self.resumed = [*self.resumed, self.iteration[-1]]

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
+from casa_sara.solver.l1_weights import first_weights, reweight
 from casa_sara.solver.positivity import Release
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE, SolverRecord
 
-__all__ = ["Schedule", "band_noise", "solve"]
+__all__ = ["Schedule", "Stage", "solve"]
 
-SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at the end
 RISE = 1.05  # of the residual norm within one interval, from its least
 STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
@@ -53,45 +53,59 @@ class Schedule:
     @property
     def expected_iterations(self) -> int:
         """A guess of how many iterations it takes, for the progress."""
-        return min(self.niter, (min(self.nreweights, USUAL) + 3) * self.interval)
+        return min(self.niter, (self.expected_reweightings + 3) * self.interval)
+
+    @property
+    def expected_reweightings(self) -> int:
+        """A guess of how many re-weightings it takes."""
+        return min(self.nreweights, USUAL)
 
 
-def band_noise(ppd, bounds, seed=20180404):
-    """Standard deviation of the noise in every band of the dictionary, and of a pixel, in the unit of the model.
+@dataclass
+class Stage:
+    """Where Algorithm 2 stands, beside the iteration and its bounds.
 
-    One realisation of the noise, weighted by 1/s_m² as the data are, is carried to the image and normalised by
-    the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
-    scratch space.
-
-    Parameters
+    Attributes
     ----------
-    ppd : AdaptivePPD
-    bounds : GivenBounds or AdaptiveBounds
-
-    Returns
-    -------
-    bands : float (number of bands,)
-        In the order of `dictionary.bands()`.
-    pixel : float
-        Of a Dirac coefficient, which is a pixel divided by √(number of bases).
+    previous : real (nx, ny)
+        Model of the problem before.
+    last : bool
+        The weights will not change any more.
+    start : int
+        Iteration after which the present problem began.
+    settled : int
+        For how many iterations the model has changed by less than the tolerance.
+    release : Release
+    record : SolverRecord
     """
-    rng = np.random.default_rng(seed)
-    noise = np.empty_like(ppd.vis)
-    for j, (a, b) in enumerate(ppd.blocks()):
-        noise[a:b] = rng.standard_normal(b - a) + 1j * rng.standard_normal(b - a)
-        noise[a:b] *= np.sqrt(bounds.noise_weights[j] * ppd.spread[a:b])
-    image = ppd.measurement.adjoint(noise)
-    image /= image.dtype.type(bounds.total_weight)
-    coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
-    bands = [_rms(coefs[band.slice]) for band in ppd.dictionary.bands()]
-    return np.maximum(bands, 1e-30), _rms(image) / np.sqrt(ppd.dictionary.n_bases)
+
+    previous: np.ndarray
+    last: bool = False
+    start: int = 0
+    settled: int = 0
+    release: Release = field(default_factory=Release)
+    record: SolverRecord = field(default_factory=SolverRecord)
+
+    @property
+    def k(self) -> int:
+        """Number of the problem, which is that of the re-weightings before it."""
+        return len(self.record.reweightings)
+
+    def state(self):
+        """Return all of it: plain values, and the arrays themselves."""
+        return vars(self) | dict(release=self.release.state(), record=self.record.state())
+
+    @classmethod
+    def of(cls, state):
+        """Make it of what :meth:`state` has returned."""
+        stage = cls(np.array(state["previous"]), state["last"], state["start"], state["settled"])
+        stage.release.set_state(state["release"])
+        stage.record.set_state(state["record"])
+        return stage
 
 
-def _rms(values):
-    return float(np.sqrt(np.mean(np.square(values, dtype=float))))
-
-
-def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False):
+def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False,
+          keep=lambda stage, now: None, stage=None):
     """Algorithm 2: solve, re-weight, and solve again until nothing changes.
 
     The weights start at W = ν, the noise of each band relative to that of a pixel (at least 1); those of re-weighting k
@@ -109,97 +123,94 @@ def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, s
         Called after every iteration with (ppd, record).
     stopped : callable
         Asked after every iteration; True ends the solution with what there is.
+    keep : callable
+        Called between iterations with the stage, and whether the solution was stopped: from the states of `ppd`,
+        `bounds` and the stage at such a moment another call goes on as this one would have.
+    stage : Stage, optional
+        Where to go on from, with `ppd` and `bounds` in the states that belong to it.
 
     Returns
     -------
     SolverRecord
     """
-    record = SolverRecord()
-    bounds.apply_to(ppd)
-    _first_weights(ppd, bounds)
-    record.bounds.append((0, bounds.l2_bounds.copy()))
-    previous, release = ppd.model.copy(), Release()
-
-    def solve_one(k, last):
-        return _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped)
-
-    for k in range(schedule.nreweights):
-        record.stop_code = solve_one(k, False)
-        if record.stop_code != CONVERGED:
+    stage = _begin(ppd, bounds) if stage is None else stage
+    record = stage.record
+    while True:
+        if stage.k >= schedule.nreweights and not stage.last:
+            _begin_last(ppd, bounds, stage)
+        record.stop_code = _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep)
+        if stage.last or record.stop_code != CONVERGED:
             break
-        change = _relative(ppd.model, previous)
-        scale = FIRST_SCALE * schedule.reweight_decay**k
-        released = release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
-        if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:
-            break
-        previous[...] = ppd.model
-        if scale <= LAST_SCALE:
-            bounds.share(ppd)
-        _reweight(ppd, bounds, max(scale, LAST_SCALE))
-        record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
-                                        released=released))
-    if record.stop_code in (0, CONVERGED):
-        bounds.finish(ppd)
-        record.stop_code = solve_one(len(record.reweightings), True)
+        if _renew_weights(ppd, bounds, schedule, stage):
+            stage.start, stage.settled = ppd.iteration, 0
+        else:
+            _begin_last(ppd, bounds, stage)
     if record.stop_code == DIVERGED:
-        ppd.model[...] = previous
+        ppd.model[...] = stage.previous
     return record
 
 
-def _solve_one(ppd, bounds, schedule, k, last, record, progress, stopped):
-    """Algorithm 1 for one set of weights, the k-th; return its stop code."""
-    tolerance = schedule.final_reltol if last else schedule.reltol
-    start, settled = ppd.iteration, 0
+def _begin(ppd, bounds):
+    """The first problem."""
+    bounds.apply_to(ppd)
+    first_weights(ppd, bounds)
+    stage = Stage(ppd.model.copy())
+    stage.record.bounds.append((0, bounds.l2_bounds.copy()))
+    return stage
+
+
+def _begin_last(ppd, bounds, stage):
+    """The last problem, with the weights as they are."""
+    bounds.finish(ppd)
+    stage.last, stage.start, stage.settled = True, ppd.iteration, 0
+
+
+def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
+    """Algorithm 1 for one set of weights; return its stop code."""
+    tolerance = schedule.final_reltol if stage.last else schedule.reltol
+    record = stage.record
     while True:
         ppd.step()
-        record.note(ppd, k)
+        record.note(ppd, stage.k)
         if bounds.adapt(ppd):
             record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))
         progress(ppd, record)
         if not np.isfinite(ppd.rel_change) or not np.isfinite(record.residual_norm[-1]):
             return DIVERGED
-        if stopped():
-            return STOPPED_BY_USER
         if ppd.iteration >= schedule.niter:
             return ITERATION_LIMIT
-        done = ppd.iteration - start
+        done = ppd.iteration - stage.start
         if done % schedule.interval == 0:
             _damp(ppd, record.residual_norm[-schedule.interval:])
-        if not last and done >= (FIRST_INTERVALS if k == 0 else 1) * schedule.interval:
+        if not stage.last and done >= (FIRST_INTERVALS if stage.k == 0 else 1) * schedule.interval:
             return CONVERGED
         # the model has settled; the residual and the bounds may need longer, but not for ever
-        settled = settled + 1 if ppd.rel_change < tolerance else 0
-        steady = not last or _is_steady(record.residual_norm[start:], schedule.interval)
-        if done > 1 and settled and steady and bounds.met_by(ppd):
+        stage.settled = stage.settled + 1 if ppd.rel_change < tolerance else 0
+        steady = not stage.last or _is_steady(record.residual_norm[stage.start:], schedule.interval)
+        if done > 1 and stage.settled and steady and bounds.met_by(ppd):
             return CONVERGED
-        if settled >= PATIENCE or done >= LONGEST * schedule.interval:
+        if stage.settled >= PATIENCE or done >= LONGEST * schedule.interval:
             return CONVERGED if bounds.met_by(ppd) else UNFEASIBLE
+        ending = stopped()
+        keep(stage, ending)
+        if ending:
+            return STOPPED_BY_USER
 
 
-def _first_weights(ppd, bounds):
-    """W = ν: the noise of every band in units of a pixel's, but at least 1.
-
-    Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
-    threshold at the noise of one pixel would let it through.
-    """
-    if ppd.l1_weights is None:
-        ppd.l1_weights = ppd.dictionary.allocate()
-    noise, pixel = band_noise(ppd, bounds)
-    for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel)):
-        ppd.l1_weights[band.slice] = scale
-
-
-def _band_scales(noise, pixel):
-    """ν of every band."""
-    return np.maximum(noise / pixel, 1.0)
-
-
-def _reweight(ppd, bounds, scale):
-    """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less."""
-    noise, pixel = band_noise(ppd, bounds)
-    ppd.dictionary.reweight(ppd.model, scale * np.minimum(noise, pixel), _band_scales(noise, pixel), ppd.l1_weights)
-    ppd.rescale(SHRINK * ppd.threshold)
-    bounds.apply_to(ppd)
+def _renew_weights(ppd, bounds, schedule, stage):
+    """Re-weight by the present solution; return False, with nothing done, when one more would change nothing."""
+    change = _relative(ppd.model, stage.previous)
+    scale = FIRST_SCALE * schedule.reweight_decay**stage.k
+    released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
+    if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:
+        return False
+    stage.previous[...] = ppd.model
+    if scale <= LAST_SCALE:
+        bounds.share(ppd)
+    reweight(ppd, bounds, max(scale, LAST_SCALE))
+    stage.record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
+                                          released=released))
+    return True
 
 
 def _damp(ppd, residual_norms):

@@ -49,9 +49,12 @@ PARAMETERS = (
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
     Parameter('blocks', ('int',), 0, 'Number of data blocks, each with its own bound; 0: one per snapshot', minimum=0.0),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0, maximum=1024.0),
+    Parameter('dryrun', ('bool',), False, 'Only say what the run would take: memory and time'),
+    Parameter('maxmem', ('double',), 0.0, 'Most memory to use, in GB; 0: what the machine has available', minimum=0.0),
+    Parameter('maxtime', ('string', 'int', 'double'), '', "Longest time to take, as '2h', or in minutes; '': no limit"),
     Parameter('fullsummary', ('bool',), False, 'Return dictionary with complete convergence history'),
     Parameter('report', ('bool',), False, 'Write a report of the run, imagename.report/report.html'),
-    Parameter('restart', ('bool',), False, 'Continue from imagename.model'),
+    Parameter('restart', ('bool',), False, 'Go on from imagename.checkpoint, or else continue from imagename.model'),
     Parameter('overwrite', ('bool',), False, 'Replace existing images'),
     Parameter('savemodel', ('string',), 'none', 'Options to save model visibilities (none, modelcolumn)', allowed=('none', 'modelcolumn')),
     Parameter('parallel', ('bool',), False, 'Run on several processes', allowed=(False,)),
@@ -158,6 +161,7 @@ class _tsara:
           out/try.pb        the primary beam
           out/try.sumwt     the sum of the imaging weights
           out/try.sara.json the record 'sara' of the returned dictionary, with every iteration
+        and, as long as the run has not finished, out/try.checkpoint, from which restart=True goes on.
         Images that exist are left alone, and the task refuses to start, unless restart or
         overwrite says otherwise.
 
@@ -337,6 +341,24 @@ class _tsara:
     nthreads : int, default 0
         Threads for the Fourier and wavelet transforms; no more than the machine has cores.
 
+    dryrun : bool, default False
+        True reads the data, times a few calls of the real operators on them, logs a table and returns
+        the forecast: memory by part, whether it fits, seconds of an iteration and of the whole run.
+        Nothing is written. Without it the first lines of the log tell the memory, and the line
+        after the first iterations the time.
+
+    maxmem : float, default 0.0
+        A run that would hold more than this (1 GB = 1e9 bytes, Python and CASA included) is refused
+        before it begins, with the sizes that would fit. 0 takes what the machine and the control
+        groups of the process leave.
+
+    maxtime : str or int or float, default ''
+        The iterations end early enough for the images to be written in time, and the best image so
+        far is the result, with stop code 107. Reading the data and at least 10 iterations of the
+        first fit are always done.
+        Examples: maxtime='90min'
+                  maxtime=30    (minutes)
+
     fullsummary : bool, default False
         True returns every iteration in the record 'sara' of the returned dictionary; False the
         state at each re-weighting and at the end.
@@ -347,16 +369,26 @@ class _tsara:
         beside it. The task saracompare writes the same for several images.
 
     restart : bool, default False
-        True starts from the existing imagename.model and replaces the products; the model must
-        have the shape and coordinates asked for. False starts afresh.
+        True goes on with a run that has not finished, because it was killed, the machine went down,
+        or Ctrl-C ended it: from imagename.checkpoint, which is written every minute or so, and to
+        the same image as without the interruption. It takes the same data and the same parameters
+        (nthreads and those of the weighting, the restoration and the output are free; the
+        MeasurementSets may have been moved); another checkpoint is refused, and what differs is
+        said. Where there is no checkpoint, True starts from imagename.model, which must have the
+        shape and coordinates asked for; where there is none either, from the beginning. The
+        products are replaced. With niter=0 and savemodel='modelcolumn' they stay as they are, and
+        only the column is written. False starts afresh.
 
     overwrite : bool, default False
-        True lets the task replace products of an earlier run with the same imagename. False
-        refuses to start when there are any, unless restart=True.
+        True lets the task replace products of an earlier run with the same imagename, and its
+        checkpoint when it has not finished: when there are new ones. False refuses to start when
+        there are any, unless restart=True.
 
     savemodel : {'none', 'modelcolumn'}, default 'none'
         'modelcolumn' writes the visibilities of the model into MODEL_DATA of each MeasurementSet,
-        for self-calibration. 'none' leaves the MeasurementSets untouched.
+        for self-calibration, when the images are complete. 'none' leaves the MeasurementSets
+        untouched. Together with restart=True and niter=0 it writes the visibilities of the existing
+        imagename.model and leaves the images as they are: also where a run was killed in this phase.
 
     parallel : {False}, default False
         Only False: the task runs in one process, with nthreads threads.
@@ -366,10 +398,10 @@ class _tsara:
     dict
       As tclean's: iterdone, niter, nmajordone, stopcode, stopDescription, summarymajor,
       summaryminor. Stop codes: 101 converged, 102 iteration limit, 103 noise only, 104 stopped by
-      user, 105 diverged, 106 converged but the data do not fit the bounds. The key 'sara' holds its own record: the
+      user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit. The key 'sara' holds its own record: the
       bound of each block with its snapshot, the history of re-weightings and iterations, the
-      parameters that were chosen automatically and why, and how many samples were dropped for
-      which reason.
+      parameters that were chosen automatically and why, how many samples were dropped for
+      which reason, and the iterations from which the run was resumed ('resumed').
 
     Examples
     --------
@@ -404,8 +436,8 @@ class _tsara:
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
         precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
         l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003,
-        regscale=1.0, blocks=0, nthreads=0, fullsummary=False, report=False, restart=False, overwrite=False,
-        savemodel='none', parallel=False,
+        regscale=1.0, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False,
+        restart=False, overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())

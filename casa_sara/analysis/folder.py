@@ -1,0 +1,77 @@
+"""A folder of a report: the files of the next one take the place of the earlier one's, all together."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+__all__ = ["MEASURES", "PAGE", "in_the_way", "remove", "replaced"]
+
+PAGE, MEASURES = "report.html", "measures.json"
+LIST = "report.files"  # names of the files that are the report's
+
+
+@contextmanager
+def replaced(folder: Path) -> Iterator[Path]:
+    """Yield an empty folder; what is written there takes the place of the earlier report's files when it is complete.
+
+    The file `report.files` says which files are the report's. All others stay. When something fails, everything does.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if it is not there, but not kept empty.
+
+    Raises
+    ------
+    FileExistsError
+        A file that is not of an earlier report has the name of a new one.
+    """
+    made = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    scratch = Path(tempfile.mkdtemp(prefix=".report.", dir=folder))
+    new, old = scratch / "new", scratch / "old"
+    try:
+        new.mkdir()
+        yield new
+        names = sorted([*os.listdir(new), LIST])
+        (new / LIST).write_text("\n".join(names) + "\n", encoding="utf-8")
+        if taken := in_the_way(folder, names):
+            raise FileExistsError(f"'{folder}' holds {', '.join(taken)}, not of an earlier report: choose another "
+                                  "folder, or move it away")
+        old.mkdir()
+        for name in _own(folder):
+            os.replace(folder / name, old / name)
+        for name in names:
+            os.replace(new / name, folder / name)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+        if made and not os.listdir(folder):
+            folder.rmdir()
+
+
+def in_the_way(folder: Path, names: Iterable[str]) -> list[str]:
+    """Return those of the names that stand in the folder and are not of an earlier report."""
+    own = _own(folder)
+    return [name for name in names if os.path.lexists(folder / name) and name not in own]
+
+
+def remove(folder: Path) -> None:
+    """Remove the files of a report, and the folder where it holds no others; nothing where there is none."""
+    for name in _own(folder):
+        (folder / name).unlink()
+    if folder.is_dir() and not os.listdir(folder):
+        folder.rmdir()
+
+
+def _own(folder) -> list[str]:
+    """Return the names of the files of the earlier report that are still there; a list from elsewhere does no harm."""
+    try:
+        names = (folder / LIST).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError):
+        return []
+    return [name for name in dict.fromkeys(names) if name == os.path.basename(name) and (folder / name).is_file()]

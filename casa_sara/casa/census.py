@@ -1,0 +1,75 @@
+"""How much a selection holds, told before it is read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.casa.frames import SPEED_OF_LIGHT
+from casa_sara.casa.selection import select_data
+from casa_sara.casa.tools import opened
+from casa_sara.casa.usable import LONGEST_M
+
+__all__ = ["Census", "take_census"]
+
+_CHUNK = 4_000_000  # flags read at a time
+_DOPPLER = 1 + 2e-4  # of the Earth's motion, and of the difference between phase centres
+
+
+@dataclass(frozen=True)
+class Census:
+    """What will be read, at most.
+
+    Attributes
+    ----------
+    samples : int
+        Visibilities of Stokes I.
+    reach : (float, float)
+        Largest |u| and |v| in wavelengths.
+    """
+
+    samples: int
+    reach: tuple[float, float]
+
+
+def take_census(selection, flags=False):
+    """Count the samples of a selection without its autocorrelations, in the time that the rows' uvw take to read.
+
+    Parameters
+    ----------
+    selection : casa_sara.options.Selection
+    flags : bool
+        Read the flags too, so that the count is exact but for data and weights that are not finite.
+
+    Returns
+    -------
+    Census
+    """
+    samples, reach = 0, np.zeros(2)
+    for ms in select_data(selection)[0]:
+        with opened("table", ms.name) as tb:
+            cross = tb.getcol("ANTENNA1") != tb.getcol("ANTENNA2")
+            metres = np.abs(tb.getcol("UVW")[:2])
+            metres[~(metres <= LONGEST_M)] = 0  # neither NaN nor what no baseline has
+            for group in ms.groups:
+                rows = group.rows[cross[group.rows]]
+                samples += _unflagged(tb, rows, group) if flags else rows.size * group.channels.size
+                longest = metres[:, rows].max(axis=1, initial=0.0)
+                reach = np.maximum(reach, longest * group.freqs_hz.max() * _DOPPLER / SPEED_OF_LIGHT)
+    return Census(int(samples), (float(reach[0]), float(reach[1])))
+
+
+def _unflagged(tb, rows, group):
+    """Count the samples of which no correlation is flagged."""
+    first, count = group.channels[0], 0
+    low, high = [0, int(first)], [len(group.correlations) - 1, int(group.channels[-1])]
+    step = max(1, _CHUNK // (int(np.ptp(group.channels) + 1) * len(group.correlations)))
+    for start in range(0, rows.size, step):
+        part = tb.selectrows(rows[start : start + step].tolist())
+        try:
+            flag = np.any(part.getcolslice("FLAG", low, high, [1, 1]), axis=0)[group.channels - first]
+            count += np.count_nonzero(~(flag | part.getcol("FLAG_ROW")))
+        finally:
+            part.close()
+    return count

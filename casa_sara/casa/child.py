@@ -1,0 +1,129 @@
+"""Writing with casacore in a child process.
+
+casacore ends the whole process when a write fails, as on a full disk, over a quota or on a network disk that
+went away: it throws in destructors. So what takes new disk space is written by a child process, and its
+end is an error here. Starting it takes less than half a second.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+__all__ = ["ChildError", "in_child"]
+
+JOBS = {"products": ("casa_sara.casa.products", "write_images"), "column": ("casa_sara.imaging", "write_column")}
+# sys.path comes along; the folder that Python puts first is the user's, whose files may have the names of modules
+_START = "import sys; sys.path[:] = sys.argv[1:]; del sys.argv[1:]; from casa_sara.casa.child import main; main()"
+
+
+class ChildError(RuntimeError):
+    """The child process could not do its job; the message is its last words."""
+
+
+def in_child(job: str, **arguments: Any) -> None:
+    """Do one of `JOBS` in a child process. It ends when this one does; a Ctrl-C of the terminal does not reach it.
+
+    Parameters
+    ----------
+    job : str
+    **arguments
+        Of the job: None, bool, numbers, text, arrays (but of objects), and dicts and lists of them.
+
+    Raises
+    ------
+    ChildError
+    """
+    arrays: list[np.ndarray] = []
+    header = json.dumps({"job": job, "arguments": _packed(arguments, arrays)}).encode() + b"\n"
+    child = subprocess.Popen([sys.executable, "-c", _START, *filter(None, sys.path)], stdin=subprocess.PIPE,
+                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True)
+    said: list[bytes] = []
+    reader = threading.Thread(target=lambda: said.append(child.stdout.read()), daemon=True)
+    reader.start()
+    try:
+        child.stdin.write(header)
+        for array in arrays:
+            child.stdin.write(array.reshape(-1).view(np.uint8).data)
+        child.stdin.flush()
+        child.wait()
+    except BrokenPipeError:
+        child.wait()  # it ended early, and says why
+    except BaseException:
+        child.kill()
+        child.wait()
+        raise
+    finally:
+        reader.join()
+        with suppress(BrokenPipeError):
+            child.stdin.close()
+        child.stdout.close()
+    if child.returncode:
+        raise ChildError(_last_words(said[0].decode(errors="replace"), child.returncode))
+
+
+def _last_words(text, code):
+    """Return the error in what the child printed: CASA's own words, or the exception's."""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    what = [line.removeprefix("what():").strip() for line in lines if line.startswith("what():")]
+    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    return (what or lines or [f"the process that writes ended with {how}"])[-1]
+
+
+def _packed(value, arrays):
+    """Return `value` as JSON takes it; arrays go to the end of `arrays`, their places hold kind and shape."""
+    if isinstance(value, dict):
+        return {key: _packed(entry, arrays) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_packed(entry, arrays) for entry in value]
+    if isinstance(value, np.generic):
+        return value.item()
+    if not isinstance(value, np.ndarray):
+        return value
+    arrays.append(np.ascontiguousarray(value))
+    return {"": [value.dtype.str, list(value.shape)]}
+
+
+def _unpacked(value, stream):
+    """Return what was packed, its arrays read from a stream in the same order."""
+    if isinstance(value, list):
+        return [_unpacked(entry, stream) for entry in value]
+    if not isinstance(value, dict):
+        return value
+    if "" not in value:
+        return {key: _unpacked(entry, stream) for key, entry in value.items()}
+    dtype, shape = value[""]
+    array = np.empty(shape, dtype)
+    filled = stream.readinto(array.reshape(-1).view(np.uint8).data)
+    if filled != array.nbytes:
+        raise EOFError("the process that asked has ended")
+    return array
+
+
+def main() -> None:
+    """Do the job that stands on the standard input; what CASA prints is for the parent, its log is not."""
+    from casaconfig import config
+
+    config.logfile, config.log2term = os.devnull, False
+    config.measures_auto_update = config.data_auto_update = False
+    stream = sys.stdin.buffer
+    request = json.loads(stream.readline())
+    module, function = JOBS[request["job"]]
+    arguments = _unpacked(request["arguments"], stream)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    getattr(importlib.import_module(module), function)(**arguments)
+
+
+def _end_with_parent():
+    """End this process when its input does: that happens when the parent is killed."""
+    if not os.read(sys.stdin.fileno(), 1):
+        os._exit(1)

@@ -1,0 +1,207 @@
+"""What a run will take of memory, by part, told before anything is read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from casa_sara.operators.dictionary import coefficient_bytes
+from casa_sara.operators.measurement import grid_bytes
+
+__all__ = ["Forecast", "Workload", "forecast"]
+
+# bytes of one visibility; docs/reliability.md, "Forecast", has the measurement
+SAMPLE = 46  # Visibilities: vis, two weights, uvw, row, chan
+READING = 62  # chunks, and one column joined
+POINT = 28  # of the operator: NonUniformFFT's Points
+PLANNING = 64  # frequencies and factors, while the operator is built
+SOLVER = 52  # whitened data, density, preconditioner, dual, Φx̄, Φz, spread, weights
+PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
+WEIGHING = 30  # uv cells and densities
+# image planes, each 4 bytes a pixel
+PLANE = 1.25  # primary beam and mask
+NORM, NNLS, SOLVING, WRITING = 8, 8, 10, 10
+DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
+LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
+REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one visibility, image planes
+
+@dataclass(frozen=True)
+class Workload:
+    """What memory depends on; `reach` is the largest |u| and |v| in wavelengths."""
+
+    samples: int
+    reach: tuple[float, float]
+    shape: tuple[int, int]
+    cell_rad: tuple[float, float]
+    n_bases: int
+    levels: int
+    niter: int
+    nthreads: int
+    precondition: bool = True
+    report: bool = False
+
+    @classmethod
+    def of(cls, census, grid, options, report=False):
+        """The workload of a census of the data and the task's parameters."""
+        return cls(census.samples, census.reach, grid.shape, grid.cell_rad, len(options.wavelets), options.wavelevels,
+                   options.niter, options.nthreads, options.precondition, report)
+
+    def memory(self):
+        """Return phase → part → bytes, in addition to what the process holds before it reads."""
+        data = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples}
+        phases = {"reading": data | {"while reading": READING * self.samples}}
+        data["image planes"] = self._planes(PLANE)
+        operator = data | {"operator": POINT * self.samples + self._grid()}
+        solver = operator | {"solver's visibilities": SOLVER * self.samples}
+        if self.niter > 0:
+            if self.precondition:
+                cells = DENSITY_CELL * self._side() ** 2
+                phases["density of samples"] = data | {"uv grid": WEIGHING * self.samples + cells}
+            phases["building the operator"] = operator | {"while planning": PLANNING * self.samples}
+            phases["NNLS"] = solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
+            coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
+            phases["iterating"] = solver | {
+                "image planes": self._planes(PLANE + SOLVING), "re-weighting": PASSING * self.samples,
+                "wavelet duals and weights": 2 * coefs, "wavelet workspace": workspace}
+        phases["writing"] = operator | {"while planning": PLANNING * self.samples,
+                                        "image planes": self._planes(PLANE + WRITING)}
+        if self.report:
+            phases["report"] = operator | {"drawing": REPORT + REPORT_SAMPLE * self.samples,
+                                           "image planes": self._planes(REPORT_PLANES)}
+        return phases
+
+    def _planes(self, count):
+        return int(4 * count * math.prod(self.shape))
+
+    def _side(self):
+        cell = min(self.cell_rad)
+        return math.ceil(max(n * c for n, c in zip(self.shape, self.cell_rad)) / cell)
+
+    def _grid(self):
+        reach = [min(max(wave * cell, 1e-6), 0.5) for wave, cell in zip(self.reach, self.cell_rad)]
+        return grid_bytes(self.samples, reach, self.shape)
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Memory that a workload needs, and what there is.
+
+    Attributes
+    ----------
+    workload : Workload
+    phases : dict
+        Phase → part → bytes.
+    resident : int
+        Bytes that the process holds before.
+    room : int
+        Bytes that it may take in addition.
+    iteration_s : float
+        Seconds of one iteration, NaN where it was not measured.
+    """
+
+    workload: Workload
+    phases: dict[str, dict[str, int]]
+    resident: int
+    room: int
+    iteration_s: float = math.nan
+
+    @property
+    def peak_phase(self) -> str:
+        """The phase that needs most."""
+        return max(self.phases, key=lambda phase: sum(self.phases[phase].values()))
+
+    @property
+    def needed(self) -> int:
+        """Bytes that the run takes in addition to what the process holds."""
+        return sum(self.phases[self.peak_phase].values())
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is room."""
+        return self.needed <= self.room
+
+    def lines(self):
+        """The memory as lines of a table, for the log."""
+        work, parts = self.workload, self.phases[self.peak_phase]
+        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak, {self.peak_phase}, for "
+               f"{work.shape[0]} x {work.shape[1]} pixels and {work.samples} visibilities; "
+               f"{self.room / 1e6:.0f} MB may be taken in addition to the {self.resident / 1e6:.0f} MB held now")
+        for part, size in parts.items():
+            yield f"  {part:<26}{size / 1e6:10.1f} MB"
+        yield f"  {'in all':<26}{self.needed / 1e6:10.1f} MB"
+
+    def summary(self):
+        """Return what the returned dictionary says of it: sizes in bytes."""
+        return {
+            "imsize": list(self.workload.shape),
+            "visibilities": self.workload.samples,
+            "peak_bytes": self.resident + self.needed,
+            "held_before_bytes": self.resident,
+            "available_bytes": self.room,
+            "fits": self.fits,
+            "peak_phase": self.peak_phase,
+            "memory_bytes": {phase: dict(parts) for phase, parts in self.phases.items()},
+            "iteration_s": self.iteration_s,
+        }
+
+    def require(self, maxmem_gb):
+        """Raise MemoryError, with what would fit, unless there is room."""
+        if self.fits:
+            return
+        parts = ", ".join(f"{part} {size / 1e9:.2f}" for part, size in self.phases[self.peak_phase].items())
+        least = self.resident + self.needed
+        limit = f"maxmem = {maxmem_gb:g} GB" if maxmem_gb else "the memory available"
+        raise MemoryError(
+            f"imsize = {list(self.workload.shape)} with the {self.workload.samples} visibilities of vis takes "
+            f"{least / 1e9:.2f} GB while {self.peak_phase} ({parts}, held now {self.resident / 1e9:.2f}); {limit} "
+            f"allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
+
+    def _what_fits(self):
+        """The largest image of this shape, and the most visibilities."""
+        work = self.workload
+
+        def needs(changed):
+            return replace(self, workload=changed, phases=changed.memory()).fits
+
+        def scaled(part):
+            return replace(work, shape=tuple(max(1, int(n * part) // 2 * 2) for n in work.shape))
+
+        part = _largest(lambda x: needs(scaled(x)))
+        samples = _largest(lambda x: needs(replace(work, samples=max(1, int(work.samples * x)))))
+        ways = []
+        if part:
+            ways.append(f"imsize up to {list(scaled(part).shape)}")
+        if samples:
+            most = int(work.samples * samples)
+            ways.append(f"at most {most} visibilities (select with spw, scan, …; or average them)")
+        if not ways:
+            return "No image fits, however small and with however few visibilities: more memory is needed"
+        return f"It would fit with {' or '.join(ways)}; fewer wavelets help too"
+
+
+def forecast(workload, resident, available, maxmem_gb=0.0):
+    """Forecast the memory of a workload.
+
+    Parameters
+    ----------
+    workload : Workload
+    resident, available : int
+        Bytes held by the process, and those that it can take in addition.
+    maxmem_gb : float
+        Most that the process may hold, 0 for no such limit.
+
+    Returns
+    -------
+    Forecast
+    """
+    room = min(available, int(maxmem_gb * 1e9) - resident) if maxmem_gb else available
+    return Forecast(workload, workload.memory(), resident, room)
+
+
+def _largest(fits):
+    """Largest x in (0, 1) that fits, to 1 %; 0 where none does."""
+    low, high = 0.0, 1.0
+    while high - low > 0.01 * high and high > 1e-4:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low

@@ -1,0 +1,132 @@
+"""Resolution actually reached: point sources put into the visibilities, imaged again and measured."""
+
+from __future__ import annotations
+
+import ast
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from casa_sara.analysis.points import recovered_point
+from casa_sara.casa import log
+from casa_sara.casa.ms import read_visibilities
+from casa_sara.casa.regrid import PixelMap
+from casa_sara.casa.skyimage import SkyPlane
+from casa_sara.imaging import solve_image
+from casa_sara.noise import noise_from_differences
+from casa_sara.options import ImageGrid, Selection, SolverOptions
+from casa_sara.solver.record import STOPPED_BY_USER
+from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
+
+__all__ = ["Injection", "can_be_repeated", "recover"]
+
+ARCSEC = np.radians(1 / 3600)
+
+
+@dataclass(frozen=True)
+class Injection:
+    """Point sources: pixel coordinates by name on the grid `plane`, and the flux of each in Jy.
+
+    `radius` in arcsec is that of the circle in which each is measured.
+    """
+
+    places: dict[str, tuple[float, float]]
+    plane: SkyPlane
+    flux: float
+    radius: float
+
+
+def can_be_repeated(one) -> bool:
+    """Tell whether the run that made an ImageSet can be repeated: it is tsara's, and the images say with what."""
+    return one.parameters.get("taskname") == "tsara"
+
+
+def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) -> dict[str, dict[str, float]]:
+    """Image a selection without and with point sources in it, and measure what the model has more.
+
+    Both times with the parameters in the history of the images, and from nothing, so that the models differ by the
+    sources alone. These are points, V = S exp(2πi(ul + vm + w(n − 1))), not pixels.
+
+    Parameters
+    ----------
+    one : casa_sara.casa.imagesets.ImageSet
+        Of a run of tsara.
+    injection : Injection
+    selection : Selection
+    nthreads : int
+
+    Returns
+    -------
+    dict
+        Name of the source → injected_jy, flux_jy and, where there is any, offset_arcsec and fwhm_arcsec.
+
+    Raises
+    ------
+    ValueError
+        A source, or the circle around it, is not within the image.
+    KeyboardInterrupt
+        One of the runs was stopped by Ctrl-C.
+    """
+    plane = one.model.plane
+    cell = tuple(size / ARCSEC for size in plane.cell_rad)
+    x, y = np.array(list(injection.places.values()), float).T
+    places = PixelMap(injection.plane.coordinates(), plane)(x, y).T
+    for name, place in zip(injection.places, places):
+        try:
+            recovered_point(np.zeros(plane.shape), place, injection.radius, cell)
+        except ValueError as error:
+            raise ValueError(f"inject = '{name}' is outside of '{one.name}', or nearer to its edge than "
+                             f"{injection.radius:.3g} arcsec: should be inside") from error
+    log.info(f"imaging '{one.name}' again, without and with {len(places)} point sources of {injection.flux:.4g} Jy")
+    without, with_sources = _repeat(one, places, injection.flux, selection, nthreads)
+    more = with_sources.astype(float) - without
+    found = {}
+    for name, place in zip(injection.places, places):
+        measured = recovered_point(more, place, injection.radius, cell)
+        found[name] = {"injected_jy": injection.flux, "flux_jy": measured["flux"]}
+        if "width" in measured:
+            found[name] |= {"offset_arcsec": measured["offset"], "fwhm_arcsec": measured["width"]}
+    return found
+
+
+def _repeat(one, places, flux, selection, nthreads):
+    """Return the models of the same run on the visibilities as they are, and with the sources."""
+    plane = one.model.plane
+    longitude, latitude = (float(angle) for angle in plane.centre)
+    grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    block_of_sample, _ = snapshot_blocks(data, _value(one.parameters.get("blocks", "0"), 0))
+    data, offsets = sort_into_blocks(data, block_of_sample)
+    noise, options = noise_from_differences(data, offsets), _options(one.parameters, nthreads)
+    models = []
+    for vis in (data.vis, data.vis + _visibilities(places, flux, data.uvw, plane)):
+        solved = solve_image(replace(data, vis=vis), offsets, noise, selection, grid, options)
+        if solved.record.stop_code == STOPPED_BY_USER:  # half a run says nothing of the resolution
+            raise KeyboardInterrupt
+        models.append(solved.model)
+    return models
+
+
+def _visibilities(places, flux, uvw, plane):
+    """Return complex64 (M,), the visibilities of points at pixel coordinates."""
+    vis = np.zeros(uvw.shape[1], np.complex64)
+    for x, y in places:
+        l, m = (plane.shape[0] // 2 - x) * plane.cell_rad[0], (y - plane.shape[1] // 2) * plane.cell_rad[1]
+        towards = np.array([l, m, np.sqrt(1 - l**2 - m**2) - 1])
+        vis += flux * np.exp(2j * np.pi * (towards @ uvw))
+    return vis
+
+
+def _options(parameters, nthreads) -> SolverOptions:
+    """Return the solver's options in a history; what it does not name is at its default."""
+    given = {field.name: _value(parameters[field.name], field.default)
+             for field in fields(SolverOptions) if field.name in parameters}
+    return SolverOptions(**given | {"nthreads": nthreads})
+
+
+def _value(text, default):
+    """Return a value as it is spelt in a history, of the kind of the default."""
+    if isinstance(default, str):
+        return text
+    value = ast.literal_eval(text)
+    return tuple(value) if isinstance(default, tuple) else value

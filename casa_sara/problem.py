@@ -1,0 +1,122 @@
+"""The imaging problem of whitened visibilities, and what is found of it before the iteration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.operators.norms import power_method
+from casa_sara.outliers import find_wild
+from casa_sara.solver.nnls import nnls
+from casa_sara.visibilities import Visibilities
+
+__all__ = ["Findings", "Problem", "Samples", "first_image"]
+
+ROUNDS = 6  # of leaving out wild samples
+
+
+@dataclass
+class Samples:
+    """The samples in use, by blocks, and their numbers `kept` in the data given."""
+
+    data: Visibilities
+    offsets: np.ndarray
+    density: np.ndarray
+    kept: np.ndarray
+
+    def without(self, index):
+        """Leave out samples, numbered as they are here."""
+        if len(index) == 0:
+            return self
+        good = np.delete(np.arange(self.data.size), index)
+        return Samples(self.data.take(good), np.searchsorted(good, self.offsets), self.density[good], self.kept[good])
+
+
+@dataclass
+class Findings:
+    """What is found before the first iteration.
+
+    `left_out` (n,) are the numbers of the wild samples in the data given; the others are as in `Reconstruction`, in
+    the units of the iteration.
+    """
+
+    left_out: np.ndarray
+    wild: list[dict]
+    nnls_norms: np.ndarray
+    data_norm_sq: float
+    noise_only: bool = False
+
+
+@dataclass
+class Problem:
+    """Whitened samples y = √w·V, and the operators that belong to them."""
+
+    samples: Samples
+    vis: np.ndarray
+    measurement: MeasurementOperator
+    precond: np.ndarray
+    data_norm_sq: float
+    unit_jy: float
+
+    @classmethod
+    def of(cls, samples, grid, options, unit_jy, data_norm_sq=None):
+        """Whiten the data and build their operator for images in `unit_jy`; measure its norm unless given."""
+        data = samples.data
+        sqrt_weight = np.sqrt(data.weight)
+        vis = data.vis * sqrt_weight
+        sqrt_weight *= np.float32(unit_jy)
+        measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight,
+                                          nthreads=options.nthreads)
+        precond = _preconditioner(samples.density, options.precondition)
+        if data_norm_sq is None:
+            data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),
+                                        grid.shape, dtype=np.float32)
+        return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy)
+
+
+def first_image(samples, problem_of, options, stopped=lambda: False):
+    """Find the image of positivity and a vanishing sparsity alone, where the bounds start, and the model too.
+
+    Parameters
+    ----------
+    samples : Samples
+    problem_of : callable
+        Makes the `Problem` of samples.
+    options : SolverOptions
+    stopped : callable
+        Ends the fit early when it returns True.
+
+    Returns
+    -------
+    problem : Problem
+        Without the wild samples.
+    found : Findings
+    first : real (nx, ny)
+        In `problem.unit_jy`.
+    """
+    everything, wild = samples.data.size, []
+    for _ in range(ROUNDS):
+        problem = problem_of(samples)
+        first, residual = nnls(problem.measurement, problem.vis, problem.precond, problem.data_norm_sq,
+                               positivity=options.positivity, stopped=stopped)
+        found = find_wild(samples.data, samples.offsets, residual,
+                          problem.unit_jy * float(np.abs(first).sum(dtype=float)))
+        if found.index.size == 0:
+            break
+        wild += found.named(samples.data)
+        samples = samples.without(found.index)
+    if found.index.size:
+        problem, residual = problem_of(samples), np.delete(residual, found.index)
+    left_out = np.setdiff1d(np.arange(everything), samples.kept)
+    nnls_norms = np.array([np.linalg.norm(residual[a:b]) for a, b in zip(samples.offsets[:-1], samples.offsets[1:])])
+    return problem, Findings(left_out, wild, nnls_norms, problem.data_norm_sq), first
+
+
+def _preconditioner(density, wanted):
+    """U = 1/density, largest value 1."""
+    if not wanted:
+        return np.ones(density.size, np.float32)
+    precond = 1.0 / np.asarray(density, float)
+    return (precond / precond.max()).astype(np.float32)

@@ -1,0 +1,129 @@
+"""The checkpoint of a run: what it belongs to, when it is written, and what is read from it."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from contextlib import contextmanager
+
+import numpy as np
+
+from casa_sara.solver.statefile import NEW, CheckpointError, digest, read, write
+
+__all__ = ["Checkpoint"]
+
+INTERVAL = 60.0  # s between two checkpoints, at least
+PATIENCE = 60  # times what writing one takes: less than 2 % of the run
+HEADER = dict(version=str, parameters=dict, data=dict, iteration=int, written=float)
+
+
+class Checkpoint:
+    """The checkpoint of one run: what it belongs to, when to write it, and the state read from it.
+
+    Parameters
+    ----------
+    path : str
+    version : str
+        Of the program.
+    parameters : dict
+        All that decide the image, named as the user knows them; plain values.
+    tell, warn : callable
+        Take a line for the log.
+
+    Attributes
+    ----------
+    state : dict or None
+        What :meth:`open` has read, until it was :meth:`applied`.
+    stands : bool
+        The file holds a state of this run.
+    """
+
+    def __init__(self, path, version, parameters, tell=lambda line: None, warn=lambda line: None):
+        self.path, self.tell, self.warn = path, tell, warn
+        self._header = dict(version=version, parameters=json.loads(json.dumps(parameters)), data={})
+        self.state, self._found, self._due, self.stands = None, None, 0.0, False
+
+    def open(self):
+        """Read the file into `state`.
+
+        Raises
+        ------
+        CheckpointError
+            It is damaged, or of another version or other parameters.
+        """
+        try:
+            found, state = read(self.path)
+            for name, kind in HEADER.items():
+                if not isinstance(found.get(name), kind):
+                    raise CheckpointError(f"its header lacks '{name}'")
+            for name in ("version", "parameters"):
+                self._compare(name, found[name], self._header[name])
+            self._found, self.state, self.stands = found, state, True
+        except CheckpointError as error:
+            raise self._refusal(error) from None
+
+    def identify(self, **data):
+        """Say what the data are, by arrays or None, and hold that against what was read.
+
+        Raises
+        ------
+        CheckpointError
+            The checkpoint is of other data.
+        """
+        self._header["data"] = {name: digest(np.ascontiguousarray(values)) if values is not None else None
+                                for name, values in data.items()}
+        self._due = time.monotonic() + INTERVAL
+        if self.state is not None:
+            found = self._found["data"]
+            different = [name for name, value in self._header["data"].items() if found.get(name) != value]
+            if different:
+                raise self._refusal(f"it is of other data: {', '.join(different)} differ")
+
+    @contextmanager
+    def applied(self):
+        """Yield `state`, to be put to use: what does not fit is a reason to refuse it; afterwards it is let go."""
+        try:
+            yield self.state
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise self._refusal(f"its state does not fit ({error})") from None
+        age = time.time() - self._found["written"]
+        self.tell(f"resuming from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
+        self.state = None
+
+    def keep(self, make_state, iteration, now=False):
+        """Write `make_state()` when it is time, or `now`.
+
+        What a full disk, or the like, prevents is said in the log and tried again: the run matters more.
+        """
+        begun = time.monotonic()
+        if not now and begun < self._due:
+            return
+        try:
+            write(self.path, self._header | dict(iteration=iteration, written=time.time()), make_state())
+        except OSError as error:
+            self.warn(f"the checkpoint of iteration {iteration} could not be written: {error}")
+        else:
+            self.stands, size = True, os.path.getsize(self.path) / 1e6
+            self.tell(f"checkpoint of iteration {iteration} written: '{self.path}', {size:.3g} MB")
+        done = time.monotonic()
+        self._due = done + max(INTERVAL, PATIENCE * (done - begun))
+
+    def remove(self):
+        """Remove the file, and what an interrupted write has left."""
+        for path in (self.path, self.path + NEW):
+            if os.path.lexists(path):
+                os.unlink(path)
+
+    def _compare(self, name, found, wanted):
+        if found == wanted:
+            return
+        if isinstance(wanted, dict):
+            keys = [key for key in {**found, **wanted} if found.get(key) != wanted.get(key)]
+            pairs = ", ".join(f"{key} was {found.get(key)!r} and is {wanted.get(key)!r}" for key in keys)
+            raise CheckpointError(f"it is of a run with other {name}: {pairs}")
+        raise CheckpointError(f"it is of another {name} of casa_sara: {found}, and this is {wanted}")
+
+    def _refusal(self, reason):
+        return CheckpointError(f"restart = True: '{self.path}' cannot be resumed: {reason}. Run as it was begun, or "
+                               "set restart = False and overwrite = True to begin anew, or choose another imagename")

@@ -1,0 +1,72 @@
+"""The weights W of the ℓ1 prior: from the noise of each band, and from the model."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["band_noise", "first_weights", "reweight"]
+
+SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at the end
+SLAB = 64  # lines squared at a time
+
+
+def band_noise(ppd, bounds, seed=20180404):
+    """Standard deviation of the noise in every band of the dictionary, and of a pixel, in the unit of the model.
+
+    One realisation of the noise, weighted by 1/s_m² as the data are, is carried to the image and normalised by
+    the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
+    scratch space.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+
+    Returns
+    -------
+    bands : float (number of bands,)
+        In the order of `dictionary.bands()`.
+    pixel : float
+        Of a Dirac coefficient, which is a pixel divided by √(number of bases).
+    """
+    rng = np.random.default_rng(seed)
+    noise = np.empty_like(ppd.vis)
+    for j, (a, b) in enumerate(ppd.blocks()):
+        noise[a:b] = rng.standard_normal(b - a) + 1j * rng.standard_normal(b - a)
+        noise[a:b] *= np.sqrt(bounds.noise_weights[j] * ppd.spread[a:b])
+    image = ppd.measurement.adjoint(noise)
+    image /= image.dtype.type(bounds.total_weight)
+    coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
+    bands = [_rms(coefs[band.slice]) for band in ppd.dictionary.bands()]
+    return np.maximum(bands, 1e-30), _rms(image) / np.sqrt(ppd.dictionary.n_bases)
+
+
+def _rms(values):
+    slabs = (values[start : start + SLAB] for start in range(0, len(values), SLAB))
+    return float(np.sqrt(sum(np.square(slab, dtype=float).sum() for slab in slabs) / values.size))
+
+
+def first_weights(ppd, bounds):
+    """W = ν: the noise of every band in units of a pixel's, but at least 1.
+
+    Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
+    threshold at the noise of one pixel would let it through.
+    """
+    if ppd.l1_weights is None:
+        ppd.l1_weights = ppd.dictionary.allocate()
+    noise, pixel = band_noise(ppd, bounds)
+    for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel)):
+        ppd.l1_weights[band.slice] = scale
+
+
+def _band_scales(noise, pixel):
+    """ν of every band."""
+    return np.maximum(noise / pixel, 1.0)
+
+
+def reweight(ppd, bounds, scale):
+    """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less."""
+    noise, pixel = band_noise(ppd, bounds)
+    ppd.dictionary.reweight(ppd.model, scale * np.minimum(noise, pixel), _band_scales(noise, pixel), ppd.l1_weights)
+    ppd.rescale(SHRINK * ppd.threshold)
+    bounds.apply_to(ppd)
