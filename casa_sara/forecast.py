@@ -20,7 +20,7 @@ PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
 WEIGHING = 30  # uv cells and densities
 # image planes, each 4 bytes a pixel
 PLANE = 1.25  # primary beam and mask
-NORM, NNLS, SOLVING, WRITING = 8, 8, 10, 10
+NORM, NNLS, SOLVING, WRITING = 8, 4, 10, 10
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
 REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one visibility, image planes

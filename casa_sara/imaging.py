@@ -9,6 +9,7 @@ import numpy as np
 
 import casa_sara
 from casa_sara.casa import log
+from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
 from casa_sara.casa.modelcolumn import save_model_column, write_model_column
@@ -121,12 +122,14 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         model = reconstruction.model
         data, blocks = _without_wild(data, blocks, offsets, reconstruction)
     # write
-    weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
-    residual = dirty_image(operator, data.vis - operator.forward(model), weights)
-    images = dict(psf=psf, residual=residual, model=model)
-    result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()), float(model.sum(dtype=float)),
-                    forecast.summary())
-    write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result))
+    with waiting_child() as child:  # which starts meanwhile
+        weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
+        residual = dirty_image(operator, data.vis - operator.forward(model), weights)
+        images = dict(psf=psf, residual=residual, model=model)
+        result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()),
+                        float(model.sum(dtype=float)), forecast.summary())
+        write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result),
+                       child)
     if result.finished or not checkpoint.stands:  # else one of an older run
         checkpoint.remove()
     if output.savemodel == "modelcolumn":

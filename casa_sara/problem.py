@@ -61,13 +61,13 @@ class Problem:
     unit_jy: float
 
     @classmethod
-    def of(cls, samples, grid, options, unit_jy, data_norm_sq=None):
-        """Whiten the data and build their operator for images in `unit_jy`; measure its norm unless given."""
+    def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None):
+        """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`; measure its norm unless given."""
         data = samples.data
         sqrt_weight = np.sqrt(data.weight)
         vis = data.vis * sqrt_weight
         sqrt_weight *= np.float32(unit_jy)
-        measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight,
+        measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight, eps=eps,
                                           nthreads=options.nthreads)
         precond = _preconditioner(samples.density, options.precondition)
         if data_norm_sq is None:

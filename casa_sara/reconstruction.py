@@ -8,13 +8,14 @@ from functools import partial
 import numpy as np
 
 from casa_sara.operators.dictionary import SaraDictionary
+from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
 from casa_sara.problem import Findings, Problem, Samples, first_image
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, solve
 
-__all__ = ["Reconstruction", "reconstruct", "schedule_of"]
+__all__ = ["Reconstruction", "operator_accuracy", "reconstruct", "schedule_of"]
 
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
@@ -98,7 +99,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     samples = Samples(data, np.asarray(offsets), density, np.arange(data.size))
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(np.mean(data.weight, dtype=float) ** -0.5)
-    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy)
+    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, eps=operator_accuracy(data, offsets, noise))
     if checkpoint is not None:
         checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, blocks=samples.offsets,
                             density=density, noise=noise)
@@ -175,6 +176,14 @@ def _resume(samples, problem_of, options, noise, checkpoint):
         solution.bounds.set_state(state["bounds"])
         solution.stage = Stage.of(state["stage"])
     return solution
+
+
+def operator_accuracy(data, offsets, noise):
+    """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown."""
+    if noise is None or not np.all(np.asarray(noise) > 0):
+        return SMALLEST_EPS[np.dtype(np.float32)]
+    level = np.repeat(np.asarray(noise, np.float32), np.diff(offsets))
+    return choose_eps(data.vis, data.weight / level**2)
 
 
 def schedule_of(options):

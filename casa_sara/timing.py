@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casa_sara.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
-from casa_sara.reconstruction import schedule_of
+from casa_sara.reconstruction import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.nnls import NNLS_ITERATIONS, nnls
 
@@ -79,7 +80,8 @@ def measure(data, offsets, grid, options, reading):
     start = time.perf_counter()
     scale = np.sqrt(data.weight)
     vis = data.vis * scale
-    measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=scale,
+    eps = operator_accuracy(data, offsets, noise_from_differences(data, offsets))
+    measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=scale, eps=eps,
                                       nthreads=options.nthreads)
     building = time.perf_counter() - start
     image, precond = np.ones(grid.shape, np.float32), np.ones(data.size, np.float32)

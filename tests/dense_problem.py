@@ -5,12 +5,14 @@ from dataclasses import dataclass, field
 import numpy as np
 import pywt
 
+from casa_sara.operators._workers import Workers
+
 
 class DenseMeasurement:
     """Φ as a matrix (M, nx·ny)."""
 
     def __init__(self, matrix, shape):
-        self.matrix, self.shape = matrix, shape
+        self.matrix, self.shape, self.workers = matrix, shape, Workers(1)
 
     def forward(self, image, out=None):
         out = np.empty(len(self.matrix), complex) if out is None else out

@@ -13,6 +13,7 @@ from casa_sara.casa.census import take_census
 from casa_sara.casa.quantities import seconds
 from casa_sara.deadline import Deadline
 from casa_sara.forecast import Workload, forecast
+from casa_sara.operators._workers import Workers
 from casa_sara.options import Selection
 from casa_sara.solver.nnls import nnls
 from casa_sara.solver.record import CONVERGED, TIME_LIMIT
@@ -177,7 +178,7 @@ def test_pace_leaves_out_the_first_iteration():
 
 def test_nnls_that_is_stopped_has_made_ten_iterations():
     class Identity:
-        shape, calls = (4, 4), 0
+        shape, calls, workers = (4, 4), 0, Workers(1)
 
         def forward(self, image, out):
             self.calls += 1

@@ -14,12 +14,13 @@ import signal
 import subprocess
 import sys
 import threading
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import numpy as np
 
-__all__ = ["ChildError", "in_child"]
+__all__ = ["ChildError", "in_child", "waiting_child"]
 
 JOBS = {"products": ("casa_sara.casa.products", "write_images"), "column": ("casa_sara.imaging", "write_column")}
 # sys.path comes along; the folder that Python puts first is the user's, whose files may have the names of modules
@@ -30,12 +31,34 @@ class ChildError(RuntimeError):
     """The child process could not do its job; the message is its last words."""
 
 
-def in_child(job: str, **arguments: Any) -> None:
+@contextmanager
+def waiting_child() -> Iterator[subprocess.Popen]:
+    """Yield a child process that gets ready for :func:`in_child` while this one goes on; unused, it ends at the end."""
+    child = _start()
+    try:
+        yield child
+    finally:
+        if child.returncode is None:
+            child.kill()
+            child.wait()
+            child.stdin.close()
+            child.stdout.close()
+
+
+def _start():
+    """Return a new child process, which waits for a job on its standard input."""
+    return subprocess.Popen([sys.executable, "-c", _START, *filter(None, sys.path)], stdin=subprocess.PIPE,
+                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True)
+
+
+def in_child(job: str, child: subprocess.Popen | None = None, **arguments: Any) -> None:
     """Do one of `JOBS` in a child process. It ends when this one does; a Ctrl-C of the terminal does not reach it.
 
     Parameters
     ----------
     job : str
+    child : Popen, optional
+        Of :func:`waiting_child`; else a new one.
     **arguments
         Of the job: None, bool, numbers, text, arrays (but of objects), and dicts and lists of them.
 
@@ -45,8 +68,7 @@ def in_child(job: str, **arguments: Any) -> None:
     """
     arrays: list[np.ndarray] = []
     header = json.dumps({"job": job, "arguments": _packed(arguments, arrays)}).encode() + b"\n"
-    child = subprocess.Popen([sys.executable, "-c", _START, *filter(None, sys.path)], stdin=subprocess.PIPE,
-                             stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True)
+    child = child or _start()
     said: list[bytes] = []
     reader = threading.Thread(target=lambda: said.append(child.stdout.read()), daemon=True)
     reader.start()
@@ -115,8 +137,13 @@ def main() -> None:
 
     config.logfile, config.log2term = os.devnull, False
     config.measures_auto_update = config.data_auto_update = False
+    importlib.import_module("casa_sara.casa.products")
+    importlib.import_module("casatools")
     stream = sys.stdin.buffer
-    request = json.loads(stream.readline())
+    line = stream.readline()
+    if not line:
+        return  # not needed
+    request = json.loads(line)
     module, function = JOBS[request["job"]]
     arguments = _unpacked(request["arguments"], stream)
     threading.Thread(target=_end_with_parent, daemon=True).start()

@@ -134,7 +134,7 @@ def _sync(folder):
                 os.close(handle)
 
 
-def write_products(output, plane, images, sumwt, beam, record=None):
+def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     """Write the products of a run, as tclean does.
 
     Parameters
@@ -150,6 +150,8 @@ def write_products(output, plane, images, sumwt, beam, record=None):
         Of `restore.fit_beam`.
     record : dict, optional
         Kept as `RECORD`.
+    child : Popen, optional
+        Of `child.waiting_child`, to write in.
 
     Raises
     ------
@@ -159,7 +161,7 @@ def write_products(output, plane, images, sumwt, beam, record=None):
     check_imagename(output.imagename, plane.shape)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
-            in_child("products", root=root, plane=vars(plane), images=images, sumwt=float(sumwt), beam=beam,
+            in_child("products", child, root=root, plane=vars(plane), images=images, sumwt=float(sumwt), beam=beam,
                      restoringbeam=output.restoringbeam, history=output.history)
             if record is not None:
                 jsonfile.save(root + RECORD, record)

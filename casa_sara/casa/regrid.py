@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import map_coordinates
 
 from casa_sara.casa.imageplane import slabs
 
@@ -113,6 +112,8 @@ def interpolated(pixels, place, shape):
     moved = place(x, y)
     if pixels.shape == tuple(shape) and np.abs(moved - [x, y]).max() < _SAME_PIXEL:
         return pixels.astype(float)
+    from scipy.ndimage import map_coordinates  # takes a while, and those who only write do not need it
+
     edge = np.array(pixels.shape)[:, None] - 1
     near = np.clip(moved, 0, edge)
     values = map_coordinates(pixels.astype(float), near, order=3, mode="mirror")

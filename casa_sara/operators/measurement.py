@@ -22,9 +22,10 @@ from casa_sara.operators.decimation import (
     AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable)
 from casa_sara.operators.nufft import NonUniformFFT, memory_size
 
-__all__ = ["MeasurementOperator", "check_cell", "check_field", "choose_eps", "grid_bytes"]
+__all__ = ["SMALLEST_EPS", "MeasurementOperator", "check_cell", "check_field", "choose_eps", "grid_bytes"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
+LARGEST_EPS = 1e-4
 SMALLEST_EPS = {np.dtype(np.float32): 1e-6, np.dtype(np.float64): 1e-13}
 
 
@@ -50,6 +51,11 @@ class MeasurementOperator:
     nthreads : int
         Threads used by each call.
 
+    Attributes
+    ----------
+    workers : Workers
+        These threads.
+
     Raises
     ------
     ValueError
@@ -72,7 +78,7 @@ class MeasurementOperator:
         row_scale = np.broadcast_to(1.0, self.size) if row_scale is None else np.asarray(row_scale, np.float64)
         if row_scale.shape != (self.size,):
             raise ValueError(f"row_scale must have shape ({self.size},), not {row_scale.shape}")
-        self._workers = Workers(nthreads)
+        self.workers = Workers(nthreads)
         frequencies = _cycles_per_pixel(uv, cell_rad)
         scales = np.stack([row_scale, row_scale], axis=1, dtype=self.dtype, casting="same_kind")
         lower = frequencies[1] < 0  # V(−u, −v) is the conjugate of V(u, v)
@@ -89,12 +95,12 @@ class MeasurementOperator:
             frequency -= axis.centre
             frequency *= axis.factor
         starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
-        self._nufft = NonUniformFFT(frequencies, scales, starts, counts, eps, self.dtype, self._workers)
+        self._nufft = NonUniformFFT(frequencies, scales, starts, counts, eps, self.dtype, self.workers)
         self._rows, self._columns = (
             separable(axis, size, cells, factors, self.complex_dtype)
             for axis, size, (cells, factors) in zip(axes, self.shape, self._nufft.placement))
         self._lines = np.zeros((counts[0], self.shape[1]), self.dtype)
-        self._scratch = np.zeros(scratch_shape(self._columns, self._workers.count), self.dtype)
+        self._scratch = np.zeros(scratch_shape(self._columns, self.workers.count), self.dtype)
 
     def forward(self, image, out=None):
         """Return the visibilities Φ·image, complex (M,), of a real image (nx, ny), in `out` where given."""
@@ -102,7 +108,7 @@ class MeasurementOperator:
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         _checked(out, "out", (self.size,), self.complex_dtype)
         self._nufft.clear()
-        self._workers.run(decimate, image, self._rows, self._columns, self._nufft.grid, self._lines, self._scratch)
+        self.workers.run(decimate, image, self._rows, self._columns, self._nufft.grid, self._lines, self._scratch)
         self._nufft.to_points(out)
         return out
 
@@ -115,8 +121,8 @@ class MeasurementOperator:
         out = np.empty(self.shape, self.dtype) if out is None else out
         _checked(out, "out", self.shape, self.dtype)
         self._nufft.from_points(vis)
-        self._workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
-        self._workers.run(expand_rows, self._lines, self._rows, out)
+        self.workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
+        self.workers.run(expand_rows, self._lines, self._rows, out)
         return out
 
 
@@ -181,8 +187,11 @@ def _checked(array, name, shape, dtype):
     return array
 
 
-def choose_eps(vis, weight, fraction=0.1):
-    """Return the accuracy at which the operator's errors are `fraction` of the noise.
+def choose_eps(vis, weight, dtype=np.float32):
+    """Return the accuracy at which the operator's errors are far below the noise of the image.
+
+    The errors in the naturally weighted dirty image are below eps times its peak, in practice a tenth of that; the
+    peak is at most Σw|V|/Σw and the noise is 1/√Σw.  eps is the ratio of this noise to this peak.
 
     Parameters
     ----------
@@ -190,13 +199,13 @@ def choose_eps(vis, weight, fraction=0.1):
         Jy.
     weight : real (M,)
         Inverse variance of the real part and of the imaginary part, 1/Jy².
-    fraction : float
-        Of the rms noise.
+    dtype : float32 or float64
+        Of the operator.
 
     Returns
     -------
     float
-        Between 1e-7 and 1e-4.  Below 1e-6 the operator needs double precision.
+        At most 1e-4, and not less than the operator can.
     """
-    signal = np.sqrt(np.mean(np.abs(vis) ** 2, dtype=np.float64) * np.mean(weight, dtype=np.float64))
-    return float(np.clip(fraction * np.sqrt(2) / max(signal, 1e-30), 1e-7, 1e-4))
+    peak, total = np.sum(weight * np.abs(vis), dtype=np.float64), np.sum(weight, dtype=np.float64)
+    return float(np.clip(np.sqrt(total) / max(peak, 1e-300), SMALLEST_EPS[np.dtype(dtype)], LARGEST_EPS))

@@ -45,26 +45,55 @@ def update_dual(dual, phi_bar, vis, precond, spread, multiplier, relaxation, sta
 
 
 @_jit
-def primal_step(model, anchor, model_bar, data_gradient, prior_gradient, steps, lowest):
-    """z ← z + ρ(x − z), x⁺ = max(z − τ(ηΦ†v + Ψu), lowest), x̄ = 2x⁺ − z; return ‖x⁺ − x‖² and ‖x⁺‖².
+def primal_step(model, anchor, model_bar, data_gradient, prior_gradient, steps, lowest, sums, worker, workers):
+    """z ← z + ρ(x − z), x⁺ = max(z − τ(ηΦ†v + Ψu), lowest), x̄ = 2x⁺ − z; steps are τ, η, ρ.
 
-    Steps are τ, η, ρ.
+    Row i of `sums` becomes Σ(x⁺ − x)², Σ(x⁺)², Σx⁺ and max x⁺ of row i of the image.
     """
     tau, l2_step, relaxation = steps
-    change = 0.0
-    norm = 0.0
-    flat, relaxed, bar = model.reshape(-1), anchor.reshape(-1), model_bar.reshape(-1)
-    g, p, low = data_gradient.reshape(-1), prior_gradient.reshape(-1), lowest.reshape(-1)
-    for i in range(flat.size):
-        old = flat[i]
-        start = relaxed[i] + relaxation * (old - relaxed[i])
-        new = start - tau * (l2_step * g[i] + p[i])
-        if new < low[i]:
-            new = low[i]
-        difference = new - old
-        relaxed[i] = start
-        flat[i] = new
-        bar[i] = new + (new - start)
-        change += difference * difference
-        norm += new * new
-    return change, norm
+    for i in range(model.shape[0] * worker // workers, model.shape[0] * (worker + 1) // workers):
+        change = norm = flux = 0.0
+        peak = model.dtype.type(-np.inf)
+        for k in range(model.shape[1]):
+            old = model[i, k]
+            start = anchor[i, k] + relaxation * (old - anchor[i, k])
+            new = start - tau * (l2_step * data_gradient[i, k] + prior_gradient[i, k])
+            if new < lowest[i, k]:  # NaN stays NaN, and is found
+                new = lowest[i, k]
+            difference = new - old
+            anchor[i, k] = start
+            model[i, k] = new
+            model_bar[i, k] = new + (new - start)
+            change += difference * difference
+            norm += new * new
+            flux += new
+            if new > peak:
+                peak = new
+        sums[i, 0], sums[i, 1], sums[i, 2], sums[i, 3] = change, norm, flux, peak
+
+
+@_jit
+def nnls_step(model, momentum, gradient, step, penalty, positivity, uphill, worker, workers):
+    """Replace the gradient g at the momentum point m by x⁺ = m + step·g, less the penalty towards 0, x⁺ ≥ 0 if `positivity`.
+
+    Entry i of `uphill` becomes Σ(m − x⁺)(x⁺ − x) of row i.
+    """
+    for i in range(model.shape[0] * worker // workers, model.shape[0] * (worker + 1) // workers):
+        total = 0.0
+        for k in range(model.shape[1]):
+            free = momentum[i, k] + step * gradient[i, k]
+            new = max(free - penalty, model.dtype.type(0))
+            if not positivity:
+                new += min(free + penalty, model.dtype.type(0))
+            gradient[i, k] = new
+            total += (momentum[i, k] - new) * (new - model[i, k])
+        uphill[i] = total
+
+
+@_jit
+def extrapolate(model, momentum, new, factor, worker, workers):
+    """m ← x⁺ + factor·(x⁺ − x), x ← x⁺."""
+    for i in range(model.shape[0] * worker // workers, model.shape[0] * (worker + 1) // workers):
+        for k in range(model.shape[1]):
+            momentum[i, k] = new[i, k] + factor * (new[i, k] - model[i, k])
+            model[i, k] = new[i, k]

@@ -42,7 +42,8 @@ class AdaptivePPD:
     Parameters
     ----------
     measurement : object
-        `forward(image, out)` → whitened visibilities (M,), `adjoint(vis, out)` → real image; `shape`.
+        `forward(image, out)` → whitened visibilities (M,), `adjoint(vis, out)` → real image; `shape`; `workers`, whose
+        `run(kernel, *arguments)` calls kernel(*arguments, worker, workers) on every thread.
     dictionary : object
         `allocate()`, `dual_step(model_bar, dual, threshold, weights, out, relaxation)` with ‖Ψ‖ = 1.
     vis : complex (M,)
@@ -78,6 +79,8 @@ class AdaptivePPD:
         μ_j of the model before the last step.
     rel_change : float
         σ.
+    model_flux, model_max : float
+        Σx and max x after the last step.
     unit_jy : float
         Jy/pixel in the unit of the model, for the record.
     """
@@ -101,6 +104,8 @@ class AdaptivePPD:
         self.l2_bounds = None
         self.residual_norms = np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()])
         self.rel_change = np.inf
+        self.model_flux = self.model_max = 0.0
+        self._sums = np.zeros((measurement.shape[0], 4))
         self.iteration = 0
         self.unit_jy = 1.0
 
@@ -133,8 +138,10 @@ class AdaptivePPD:
         # Steps 17–19: image
         dtype = self.model.dtype.type
         steps = dtype(self.tau), dtype(self.l2_step), dtype(self.relaxation)
-        change, norm = kernels.primal_step(self.model, self.anchor, self.model_bar, self._data_gradient,
-                                           self._prior_gradient, steps, self.lowest)
+        self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, self._data_gradient,
+                                     self._prior_gradient, steps, self.lowest, self._sums)
+        change, norm, self.model_flux = self._sums[:, :3].sum(axis=0).tolist()
+        self.model_max = float(self._sums[:, 3].max())
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
         self.iteration += 1
 

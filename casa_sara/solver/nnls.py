@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.solver import _kernels as kernels
+
 __all__ = ["NNLS_ITERATIONS", "nnls"]
 
 FIRST_PENALTY = 0.5  # of the brightest pixel of the first gradient step
@@ -25,7 +27,7 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last
     Parameters
     ----------
     measurement : object
-        `forward`, `adjoint`, `shape`.
+        `forward`, `adjoint`, `shape` and `workers`, as of :class:`casa_sara.solver.adaptive_ppd.AdaptivePPD`.
     vis : complex (M,)
     precond : real (M,)
     data_norm_sq : float
@@ -51,26 +53,22 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last
     dtype = vis.real.dtype
     model, momentum = np.zeros(measurement.shape, dtype), np.zeros(measurement.shape, dtype)
     gradient, residual = np.zeros_like(model), np.zeros_like(vis)
-    step, t, first = dtype.type(1 / data_norm_sq), 1.0, None
+    uphill = np.zeros(measurement.shape[0])
+    step, t, first, run = dtype.type(1 / data_norm_sq), 1.0, None, measurement.workers.run
     for iteration in range(max_iter):
         measurement.forward(momentum, residual)
         np.subtract(vis, residual, out=residual)
         residual *= precond
         measurement.adjoint(residual, gradient)
-        gradient *= step
-        first = FIRST_PENALTY * float(np.abs(gradient).max()) if first is None else first
-        penalty = dtype.type(first * last_penalty ** min(iteration / (PATH * max_iter), 1.0)) if last_penalty else 0
-        momentum += gradient
-        new = np.maximum(momentum - penalty, 0)
-        if not positivity:
-            new += np.minimum(momentum + penalty, 0)
-        momentum -= gradient
-        difference = new - model
+        if first is None:
+            first = FIRST_PENALTY * float(step) * float(max(gradient.max(), -gradient.min()))
+        penalty = first * last_penalty ** min(iteration / (PATH * max_iter), 1.0) if last_penalty else 0
+        run(kernels.nnls_step, model, momentum, gradient, step, dtype.type(penalty), positivity, uphill)
         # momentum that points uphill is dropped
-        t = 1.0 if np.vdot(momentum - new, difference) > 0 else t
+        t = 1.0 if uphill.sum() > 0 else t
         t_next = 0.5 * (1 + np.sqrt(1 + 4 * t * t))
-        momentum = new + dtype.type((t - 1) / t_next) * difference
-        model, t = new, t_next
+        run(kernels.extrapolate, model, momentum, gradient, dtype.type((t - 1) / t_next))
+        t = t_next
         if stopped() and iteration + 1 >= FEWEST_ITERATIONS:
             break
     measurement.forward(model, residual)

@@ -71,8 +71,8 @@ class SolverRecord:
         self.reweighting.append(reweighting)
         self.rel_change.append(ppd.rel_change)
         self.residual_norm.append(float(np.linalg.norm(ppd.residual_norms)))
-        self.model_flux.append(float(ppd.model.sum(dtype=float)) * ppd.unit_jy)
-        self.model_max.append(float(ppd.model.max()) * ppd.unit_jy)
+        self.model_flux.append(ppd.model_flux * ppd.unit_jy)
+        self.model_max.append(ppd.model_max * ppd.unit_jy)
 
     def state(self):
         """Return the history so far as plain values."""

@@ -30,11 +30,11 @@ def vis(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def run(vis, tmp_path_factory):
-    """An earlier run: the folder of its products, and how `write_products` was called."""
+    """An earlier run: the folder of its products, and how `write_products` was called, but for its child process."""
     name, called = tmp_path_factory.mktemp("old") / "source", []
 
     def noted(*args):
-        called.append(args)
+        called.append(args[:-1])
         products.write_products(*args)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -103,11 +103,11 @@ def test_the_session_goes_on_after_a_full_disk(vis, old, tmp_path, monkeypatch):
 def test_a_disk_without_room_is_refused_before_and_after_the_solution(vis, tmp_path, monkeypatch):
     with small_disk(tmp_path / "disk", 8_000) as disk:
         filler = fill(disk, 1_000_000)
-        with pytest.raises(OSError, match=r"imagename = '.*': the images take 2.1 MB, '.*' has 1.0 MB left"):
+        with pytest.raises(OSError, match=r"imagename = '.*', imsize = .*: the images take 2.1 MB, '.*' has 1.0 MB left"):
             tsara(vis=vis, imagename=str(disk / "source"), niter=0, **GRID)
         filler.unlink()
         monkeypatch.setattr("casa_sara.imaging.fit_beam", lambda *args: fill(disk, 1_000_000) and {})
-        with pytest.raises(OSError, match=r"imagename = '.*': the images take 2.1 MB, '.*' has 1.0 MB left"):
+        with pytest.raises(OSError, match=r"imagename = '.*', imsize = .*: the images take 2.1 MB, '.*' has 1.0 MB left"):
             tsara(vis=vis, imagename=str(disk / "source"), niter=0, **GRID)
         assert [path.name for path in disk.iterdir()] == ["filler"]
 
