@@ -1,14 +1,14 @@
 """Time and memory of one whole iteration of adaptive PPD, beside the same algorithm on PyWavelets and finufft.
 
-    python benchmarks/iteration.py [--cases 0 1 2 …] [--repeat 15]
+    python benchmarks/iteration.py [--cases 0 1 2 …] [--repeat 15] [--pfb]
 
 The iteration is that of the task: single precision, Dirac and Db1–Db8 on four levels, weights, over-relaxation, all blocks
 through one operator. "PyWavelets + finufft" is the same algorithm (the same class, in double precision) on wavedec2 and
 waverec2, the bases shared out to threads, and on finufft with its defaults, one transform for all blocks. Medians (quartiles);
 both take turns. The floor: bytes that have to be moved (image-sized and visibility-sized arrays, coefficients and weights, grid)
 over the copy bandwidth measured in the same run, or the multiplications and additions of the wavelet filters over the peak rate,
-whichever is more. Where pfb-imaging is installed, the analysis and synthesis of its dictionary are timed too, in double precision
-as it has them.
+whichever is more. With --pfb the analysis and synthesis of pfb-imaging's dictionary (from PyPI) are timed too, in double
+precision as it has them.
 
 Memory is that of a process with casatools loaded, above what it takes before, at its peak through operators and iterations; growth
 is what is added from the 10th iteration to the last.
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import gc
-import importlib.util
 import subprocess
 import sys
 from pathlib import Path
@@ -33,6 +32,7 @@ from dictionary import PyWaveletsStep, filter_flops
 from machine import bandwidth, machine, peak, resident_mb, seconds, spread
 from measurement_operator import Finufft, vla_uv
 
+from casa_sara.operators._workers import Workers
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.solver.adaptive_ppd import RELAXATION, AdaptivePPD
@@ -60,7 +60,7 @@ class DefaultFinufft(Finufft):
 
     def __init__(self, uv, cell, shape, nthreads):
         super().__init__(uv, cell, shape, 1e-6, "f8", nthreads)
-        self.shape = shape
+        self.shape, self.workers = shape, Workers(nthreads)
 
 
 def visibilities(case):
@@ -190,6 +190,7 @@ def main():
     parser.add_argument("--cases", type=int, nargs="+", default=list(range(len(CASES))), help="numbers of the table's lines")
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--slow-repeat", type=int, default=3, help="repetitions of PyWavelets and finufft")
+    parser.add_argument("--pfb", action="store_true", help="time pfb-imaging's dictionary too, which has to be installed")
     parser.add_argument("--memory", type=int, metavar="CASE", help="only measure the memory of this case, in this process")
     parser.add_argument("--iterations", type=int, default=1000, help="for the growth of the memory")
     options = parser.parse_args()
@@ -202,7 +203,7 @@ def main():
           "| PyWavelets + finufft, ms | ratio | floor, ms | iteration / floor |\n" + "|---" * 10 + "|")
     for case in cases:
         time_case(case, options.repeat, options.slow_repeat)
-    if importlib.util.find_spec("pfb_imaging"):
+    if options.pfb:
         compare_with_pfb(cases, options.slow_repeat)
     print("\n| image | visibilities, blocks | casatools, MB | more at the peak, MB | iterations | growth, MB |\n" + "|---" * 6 + "|",
           flush=True)

@@ -39,10 +39,10 @@ def worker(path):
 
     job = json.loads(Path(path).read_text())
     with quiet(Path(path).with_suffix(".txt")):
+        from casatasks import tclean as task
+
         if job["task"] == "tsara":
             from casa_sara import tsara as task
-        else:
-            from casatasks import tclean as task
         begin = time.perf_counter()
         task(**job["parameters"])
         seconds = time.perf_counter() - begin

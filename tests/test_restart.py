@@ -25,20 +25,24 @@ GRID = dict(imsize=64, cell="1arcsec", datacolumn="data", nthreads=1, wavelets=[
 PRODUCTS = ("model", "psf", "residual", "image", "sumwt", "pb")
 RNG = np.random.default_rng(20)
 KILLED = {
-    "early": ("iteration", 1),  # before there is any checkpoint
+    # before there is any checkpoint
+    "reading": ("read", 1),
+    "norm": ("norm", 1),
+    "early": ("iteration", 1),
     "middle": ("iteration", int(RNG.integers(2, 60))),
     "updates": ("iteration", 91),  # the second re-weighting is just done
     "late": ("iteration", int(RNG.integers(120, 250))),
     "writing": ("checkpoint", int(RNG.integers(20, 80))),
     "product": ("product", 1),
 }
+TOO_EARLY = ("reading", "norm", "early")
 STOPPED = {"interrupted": signal.SIGINT, "terminated": signal.SIGTERM}
 # Runs that signal themselves at a certain moment: the Nth iteration, checkpoint (written, not yet in place) or product.
 # CASA is imported once, and every run is a process forked from there.
 SCRIPT = """
 import json, os, sys
 import casatasks
-from casa_sara import tsara
+from casa_sara import imaging, problem, tsara
 from casa_sara.casa import log, products
 from casa_sara.private import task_tsara
 from casa_sara.solver import checkpoint
@@ -61,6 +65,8 @@ def run(folder, parameters, place, moment, number):
 
     checkpoint.INTERVAL = checkpoint.PATIENCE = 0  # one after every iteration
     log.Progress = Progress
+    imaging.read_visibilities = watched(imaging.read_visibilities, "read")
+    problem.power_method = watched(problem.power_method, "norm")
     os.replace = watched(os.replace, "checkpoint")
     products._sync = watched(products._sync, "product")  # written, not yet in place
     os.chdir(folder)
@@ -125,13 +131,14 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_image(uninterrupted, ended,
     folder, status, output = ended[moment]
     assert status == -signal.SIGKILL, output
     place, count = KILLED[moment]
-    left = {"source.lock"} | (set() if moment == "early" else {"source.checkpoint"})  # the lock of a killed run locks nothing
+    left = {"source.lock"} | (set() if moment in TOO_EARLY else {"source.checkpoint"})  # a killed run's lock locks nothing
     left |= {"source.checkpoint.new"} if place == "checkpoint" else set()
     assert names_in(folder) - left == set() or place == "product"
     assert left <= names_in(folder)
     result = tsara(vis=vis, imagename=str(folder / "source"), restart=True, **GRID)
-    expected = {"early": [], "product": [uninterrupted[0]["iterdone"] - 1], "writing": [count - 1],
-                "updates": [89]}  # the image of an iteration that ends a problem is the next problem's
+    # the image of an iteration that ends a problem is the next problem's: 89
+    expected = {"product": [uninterrupted[0]["iterdone"] - 1], "writing": [count - 1], "updates": [89]}
+    expected |= dict.fromkeys(TOO_EARLY, [])
     assert result["sara"]["resumed"] == expected.get(moment, [count - 1])
     assert_the_same(uninterrupted, str(folder / "source"), result)
 
