@@ -61,7 +61,7 @@ def run(folder, parameters, place, moment, number):
             at("iteration")
 
     def watched(function, here):
-        return lambda *args, **more: (at(here), function(*args, **more))
+        return lambda *args, **more: (at(here), function(*args, **more))[1]
 
     checkpoint.INTERVAL = checkpoint.PATIENCE = 0  # one after every iteration
     log.Progress = Progress
