@@ -5,6 +5,8 @@ import pytest
 from dense_problem import Problem
 from scipy.optimize import minimize, nnls as scipy_nnls
 
+from casa_sara.operators._workers import Workers
+from casa_sara.solver import _kernels as kernels
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.nnls import nnls
@@ -283,3 +285,35 @@ def test_iteration_limit_and_stop_request():
     ppd = _ppd(problem)
     record = solve(ppd, _given(problem, problem.errors), stopped=lambda: ppd.iteration == 4)
     assert (record.stop_code, record.iteration[-1]) == (STOPPED_BY_USER, 4)
+
+
+@pytest.mark.parametrize("positivity", [True, False])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_passes_of_nnls_are_what_they_say(positivity, threads):
+    rng = np.random.default_rng(12)
+    model, momentum, gradient = rng.normal(size=(3, 7, 5))
+    free, uphill = momentum + 0.7 * gradient, np.zeros(7)
+    new = np.maximum(free - 0.3, 0) + (0 if positivity else np.minimum(free + 0.3, 0))
+    expected = ((momentum - new) * (new - model)).sum(axis=1), new + 0.4 * (new - model)
+    run = Workers(threads).run
+    run(kernels.nnls_step, model, momentum, gradient, 0.7, 0.3, positivity, uphill)
+    np.testing.assert_allclose(gradient, new)
+    np.testing.assert_allclose(uphill, expected[0])
+    run(kernels.extrapolate, model, momentum, gradient, 0.4)
+    np.testing.assert_allclose(momentum, expected[1])
+    np.testing.assert_array_equal(model, gradient)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_the_image_step_is_what_it_says(threads):
+    rng = np.random.default_rng(13)
+    model, anchor, bar, data, prior = rng.normal(size=(5, 7, 5))
+    lowest, sums = np.full((7, 5), -0.2), np.zeros((7, 4))
+    start = anchor + 1.8 * (model - anchor)
+    new = np.maximum(start - 0.4 * (2.0 * data + prior), lowest)
+    expected = ((new - model) ** 2).sum(axis=1), (new**2).sum(axis=1), new.sum(axis=1), new.max(axis=1)
+    Workers(threads).run(kernels.primal_step, model, anchor, bar, data, prior, (0.4, 2.0, 1.8), lowest, sums)
+    np.testing.assert_allclose(model, new)
+    np.testing.assert_allclose(anchor, start)
+    np.testing.assert_allclose(bar, 2 * new - start)
+    np.testing.assert_allclose(sums.T, expected)
