@@ -39,10 +39,11 @@ def worker(path):
 
     job = json.loads(Path(path).read_text())
     with quiet(Path(path).with_suffix(".txt")):
-        from casatasks import tclean as task
+        import casatasks
 
-        if job["task"] == "tsara":
-            from casa_sara import tsara as task
+        import casa_sara
+
+        task = casa_sara.tsara if job["task"] == "tsara" else casatasks.tclean
         begin = time.perf_counter()
         task(**job["parameters"])
         seconds = time.perf_counter() - begin

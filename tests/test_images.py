@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_ms import CYGNUS_A, column, edit, simulate
+from simulated_ms import CYGNUS_A, edit, simulate
 
 from casa_sara.casa import log
 from casa_sara.casa.imageplane import define_image_plane

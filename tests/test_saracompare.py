@@ -25,7 +25,7 @@ from casa_sara import injection, jsonfile, saracompare, tsara
 from casa_sara.analysis import metrics
 from casa_sara.casa.imagesets import read_image_set
 from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.skyimage import read_header, read_sky_image
+from casa_sara.casa.skyimage import read_header
 from casa_sara.casa.weights import imaging_weights
 from casa_sara.compare import compare_images
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_ms import add_column, edit, simulate
+from simulated_ms import edit, simulate
 
 casatools = pytest.importorskip("casatools")
 
