@@ -7,34 +7,31 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-import casa_sara
 from casa_sara.casa import log
 from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
 from casa_sara.casa.modelcolumn import save_model_column, write_model_column
 from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.products import CHECKPOINT, write_products
+from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.tools import opened
-from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
+from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
 from casa_sara.deadline import Deadline
-from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator, check_cell, check_field
 from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
-from casa_sara.reconstruction import Reconstruction, reconstruct, schedule_of
+from casa_sara.reconstruction import Reconstruction, schedule_of
 from casa_sara.rehearsal import foresee
-from casa_sara.solver.checkpoint import Checkpoint
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
+from casa_sara.solver.record import UNFINISHED
+from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
-from casa_sara.visibilities import BlockInfo, Visibilities, clock, snapshot_blocks, sort_into_blocks
+from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sort_into_blocks
 
-__all__ = ["Result", "checkpoint_of", "make_image", "solve_image", "write_column"]
+__all__ = ["Result", "make_image", "write_column"]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
-MOST_NAMED = 20  # wild samples that the log names one by one
 MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
 REPORT_SECONDS = 30.0
 IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
@@ -60,14 +57,6 @@ class Result:
     def finished(self) -> bool:
         """Whether there is nothing left for a restart to go on with."""
         return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
-
-
-@dataclass
-class Watch:
-    """The clocks of a solution: when it has to end, and how long an iteration takes."""
-
-    deadline: Deadline
-    pace: Pace
 
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
@@ -120,7 +109,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         model = reconstruction.model
-        data, blocks = _without_wild(data, blocks, offsets, reconstruction)
+        data, blocks = without_wild(data, blocks, offsets, reconstruction)
     # write
     with waiting_child() as child:  # which starts meanwhile
         weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
@@ -186,91 +175,6 @@ def _after_iterations(data, grid, output, limits, read_s):
     """Seconds to keep for what comes after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
     return writing_seconds(data.size, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
-
-
-def checkpoint_of(selection, grid, options, output):
-    """Return the checkpoint of a run, which knows the parameters that decide the model, by the names of the task.
-
-    Where the data are is none of them (they are known by their contents), nor is how many threads there are.
-    """
-    startmodel = output.startmodel if output.startmodel != output.imagename + ".model" else ""  # that of restart = True
-    parameters = asdict(selection) | asdict(grid) | asdict(options) | dict(blocks=output.blocks, startmodel=startmodel)
-    parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
-    for name in ("vis", "nthreads"):
-        del parameters[name]
-    return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
-
-
-def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None):
-    """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
-
-    Parameters
-    ----------
-    data : Visibilities
-    offsets : int (d + 1,)
-        Block j is the slice offsets[j]:offsets[j + 1].
-    noise : float (d,)
-        Measured in the data, in units of what the weights say; NaN where unknown.
-    selection : Selection
-        That gave the data, for their sampling density.
-    grid : ImageGrid
-    options : SolverOptions
-    start : float32 (nx, ny), optional
-        First model, Jy/pixel.
-    checkpoint : Checkpoint, optional
-        Where the state is kept now and then, or was.
-    watch : Watch, optional
-
-    Returns
-    -------
-    Reconstruction
-    """
-    density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
-    progress = log.Progress()
-    expected = schedule_of(options).expected_iterations
-
-    def report(ppd, record):
-        begun = record.resumed[-1] if record.resumed else 0
-        if watch and (words := watch.pace(ppd.iteration - begun)):
-            log.info(words)
-        fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-        progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
-                 f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
-
-    with stop_on_interrupt() as pressed:
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
-                                     lambda: pressed() or bool(watch and watch.deadline.near()), checkpoint)
-    progress.close()
-    record = reconstruction.record
-    if record.stop_code == STOPPED_BY_USER and not pressed():
-        record.stop_code = TIME_LIMIT
-    say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
-    say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
-    if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
-        log.info(f"restart = True goes on from '{checkpoint.path}'")
-    released = sum(update["released"] for update in record.reweightings)
-    if released:
-        log.info(f"{released} pixels beside unresolved sources were allowed to be negative: the sources are between pixels")
-    for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
-        log.info(f"block {j}: l2 bound {bound:.5g}, residual {norm:.5g} (whitened)")
-    return reconstruction
-
-
-def _without_wild(data, blocks, offsets, reconstruction):
-    """Leave out what the reconstruction left out, and say what that was."""
-    wild = reconstruction.wild
-    if not wild:
-        return data, blocks
-    log.warn(f"{len(wild)} wild samples, which no sky explains, are left out:")
-    for one in wild[:MOST_NAMED]:
-        log.warn(f"  {one['ms']} row {one['row']}, spw {one['spw']}, channel {one['channel']}, antennas "
-                 f"{one['antenna1']} and {one['antenna2']}, {clock(one['time_mjd_s'])}: {one['amplitude_jy']:.4g} Jy where "
-                 f"the image has {one['predicted_jy']:.4g} Jy")
-    if len(wild) > MOST_NAMED:
-        log.warn(f"  … and {len(wild) - MOST_NAMED} more, in the record's 'wild'")
-    samples = np.diff(np.searchsorted(reconstruction.kept, offsets))
-    blocks = [replace(block, samples=int(count)) for block, count in zip(blocks, samples)]
-    return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks
 
 
 def _describe(data, blocks, noise):

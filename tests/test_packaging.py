@@ -53,11 +53,14 @@ NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["forecast"] = {"casa_sara.operators"}
 ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
 ROOMS["rehearsal"] = {"casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", *NUMERICS}
+ROOMS["solving"] = {
+    "casa_sara", "casa_sara.casa", "casa_sara.deadline", "casa_sara.interrupt", "casa_sara.timing", "numpy", *NUMERICS,
+}
 ROOMS["imaging"] = {
-    "casa_sara", "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.interrupt", "casa_sara.rehearsal",
+    "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.rehearsal", "casa_sara.solving",
     "casa_sara.timing", "numpy", *NUMERICS,
 }
-ROOMS["injection"] = {"casa_sara.casa", "casa_sara.imaging", "numpy", *NUMERICS}
+ROOMS["injection"] = {"casa_sara.casa", "casa_sara.solving", "numpy", *NUMERICS}
 ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "numpy", *NUMERICS}
 ROOMS["demo"] = {
     "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "casa_sara.resources", "numpy", "finufft",
