@@ -12,10 +12,10 @@ from casa_sara.casa import log
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.regrid import PixelMap
 from casa_sara.casa.skyimage import SkyPlane
-from casa_sara.solving import solve_image
 from casa_sara.noise import noise_from_differences
 from casa_sara.options import ImageGrid, Selection, SolverOptions
 from casa_sara.solver.record import STOPPED_BY_USER
+from casa_sara.solving import solve_image
 from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
 
 __all__ = ["Injection", "can_be_repeated", "recover"]

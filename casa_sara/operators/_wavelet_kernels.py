@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from numba.extending import register_jitable
 
 from casa_sara.operators._simd import MAX_TAPS, VECTOR_BYTES
 from casa_sara.operators._wavelet_lines import (
@@ -64,7 +65,7 @@ class Job(NamedTuple):
     work: Work
 
 
-@compiled
+@register_jitable  # compiled within kernels; called from Python as it is, which does not wait for a compiler
 def padded_width(n, size):
     """Values to reserve for a line of n: whole quadruples of vectors, and one vector against cache conflicts."""
     width = VECTOR_BYTES // size
