@@ -85,9 +85,10 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
     data.notes.extend(_limits(data, grid))
-    plane = define_image_plane(data, selection, grid)
+    plane = define_image_plane(data, selection, grid, output.pblimit)
     if not plane.mask.any():
-        data.notes.append(f"phasecenter = '{grid.phasecenter}': the image is outside the primary beam, and masked everywhere")
+        data.notes.append(f"phasecenter = '{grid.phasecenter}': the primary beam is nowhere in the image above pblimit = "
+                          f"{output.pblimit:g}, and its pixels are masked everywhere")
     for note in data.notes:
         log.warn(note)
     start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None

@@ -93,7 +93,7 @@ class Output:
     """Where results go, and what goes along.
 
     `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image;
-    `resume` says to go on from the checkpoint. With `images_stand` the products of an earlier run stay as they are, and
+    `resume` says to go on from the checkpoint. `pbcor` asks for the images divided by the primary beam. With `images_stand` the products of an earlier run stay as they are, and
     only the model column is written.
     """
 
@@ -105,6 +105,8 @@ class Output:
     images_stand: bool = False
     history: tuple[str, ...] = ()
     resume: bool = False
+    pblimit: float = 0.2
+    pbcor: bool = False
 
 
 @dataclass(frozen=True)

@@ -32,6 +32,7 @@ EXCEPTIONS = {
     ("niter", "range"): SURER,
     ("npixels", "range"): SURER,
     ("parallel", "allowed"): NARROWER,
+    ("pblimit", "range"): SURER,
     ("projection", "allowed"): "the projection of an interferometer; others would put sources in wrong places",
     ("reffreq", "types"): "a frequency with its unit; tclean's variant lets anything through",
     ("restart", "default"): "an old model must not enter a new image unasked; tclean's False renames the images",
@@ -298,7 +299,7 @@ def closing_and_opening(parameter):
 )
 def test_sub_parameter_that_would_be_ignored_is_refused(received, parameter):
     closing, opening = closing_and_opening(parameter)
-    other = {"string": "x", "stringVec": ["x"], "double": 0.25, "doubleVec": [0.25], "int": 7}[parameter.types[0]]
+    other = {"bool": True, "string": "x", "stringVec": ["x"], "double": 0.25, "doubleVec": [0.25], "int": 7}[parameter.types[0]]
     message = f"{parameter.name} = .* has no effect with {parameter.opener} = .*: set {parameter.opener} to"
     with pytest.raises(ValueError, match=message):
         tsara(**GOOD, **{parameter.opener: closing[0], parameter.name: other})

@@ -16,7 +16,7 @@ from casa_sara.casa.tools import opened, scratch_folder
 
 __all__ = ["ImagePlane", "define_image_plane", "read_pixels", "slabs"]
 
-PB_LIMIT = 0.2  # of tclean: below it, .pb is zero and .pb, .residual and .image are masked
+PB_LIMIT = 0.2  # of tclean
 _SELECTDATA_KEYS = {"timerange": "timestr", "uvrange": "uvdist", "observation": "obs", "intent": "state"}
 _SLAB = 4_000_000  # pixels read or written at a time
 
@@ -30,13 +30,15 @@ class ImagePlane:
     csys : dict
         Record of the coordinate system: right ascension, declination, Stokes, frequency.
     pb : float32 (nx, ny)
-        Primary beam, at most 1, and 0 below `PB_LIMIT`.
+        Primary beam, at most 1, and 0 below the limit.
     mask : bool (nx, ny)
-        Good pixels, where the primary beam is above `PB_LIMIT`.
+        Good pixels, where the primary beam is above the limit.
     imageinfo : dict
         Name of the source and type of the image.
     miscinfo : dict
         Telescope and distance.
+    masks_all : bool
+        Whether .residual and .image have the mask, or only .pb and what is divided by it.
     """
 
     csys: dict
@@ -44,6 +46,7 @@ class ImagePlane:
     mask: np.ndarray
     imageinfo: dict
     miscinfo: dict
+    masks_all: bool = True
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -51,7 +54,7 @@ class ImagePlane:
         return self.pb.shape
 
 
-def define_image_plane(visibilities, selection, grid):
+def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT):
     """Return the image plane that tclean makes of this selection and grid.
 
     As in tclean, the MeasurementSet that begins first gives the date, the observer and the
@@ -63,6 +66,8 @@ def define_image_plane(visibilities, selection, grid):
         What was read, for its phase centre and the MeasurementSets that it comes from.
     selection : casa_sara.options.Selection
     grid : casa_sara.options.ImageGrid
+    pblimit : float
+        |pblimit| is the lowest primary beam; where it is negative, only .pb and what is divided by it are masked.
 
     Returns
     -------
@@ -84,10 +89,10 @@ def define_image_plane(visibilities, selection, grid):
         with opened("table", root + ".pb") as tb:
             imageinfo = tb.getkeyword("imageinfo")
     pb /= max(pb.max(), np.float32(1))  # above 1 where several fields are imaged together
-    mask = pb > PB_LIMIT
+    mask = pb > abs(pblimit)
     pb[~mask] = 0
     kept = {key: miscinfo[key] for key in ("INSTRUME", "distance") if key in miscinfo}
-    return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept)
+    return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept, masks_all=bool(pblimit >= 0))
 
 
 def read_pixels(ia, getmask=False):

@@ -1,4 +1,5 @@
-"""What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, and the record .sara.json.
+"""What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
+(.image.pbcor .model.pbcor), and the record .sara.json.
 
 They appear together. They are written in `.<name>.new`, beside their places; when all are complete and on the disk, the
 folder is renamed `.<name>.whole`, and from then on they are the products: the older ones go to `.<name>.old`, the
@@ -21,7 +22,7 @@ from casa_sara import jsonfile
 from casa_sara.casa.child import ChildError, in_child
 from casa_sara.casa.imageplane import ImagePlane
 from casa_sara.casa.images import write_image
-from casa_sara.casa.restore import restore
+from casa_sara.casa.restore import restore, write_corrected
 from casa_sara.casa.tools import opened
 from casa_sara.interrupt import signals_deferred
 
@@ -32,13 +33,15 @@ __all__ = [
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
+ON_REQUEST = (".image.pbcor", ".model.pbcor")
 CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
 
 
 def existing_products(imagename):
     """Return the paths of the products that stand under this name."""
-    return [imagename + suffix for suffix in (*PRODUCTS, RECORD, REPORT) if os.path.lexists(imagename + suffix)]
+    return [imagename + suffix for suffix in (*PRODUCTS, *ON_REQUEST, RECORD, REPORT)
+            if os.path.lexists(imagename + suffix)]
 
 
 def remove_products(imagename):
@@ -47,8 +50,8 @@ def remove_products(imagename):
         shutil.rmtree(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
 
 
-def check_imagename(imagename, shape):
-    """Raise unless the products of an image of this shape can be written under this name.
+def check_imagename(imagename, shape, more=0):
+    """Raise unless the products of an image of this shape, and as many `more`, can be written under this name.
 
     Raises
     ------
@@ -63,16 +66,16 @@ def check_imagename(imagename, shape):
         raise FileNotFoundError(f"imagename = '{imagename}': the folder '{folder}' does not exist")
     if not os.access(folder, os.W_OK | os.X_OK):
         raise PermissionError(f"imagename = '{imagename}': the folder '{folder}' cannot be written to")
-    needed, free = _bytes_needed(shape), shutil.disk_usage(folder).free
+    needed, free = _bytes_needed(shape, more), shutil.disk_usage(folder).free
     if free < needed:
         space = f"the images take {needed / 1e6:.1f} MB, '{folder}' has {free / 1e6:.1f} MB left"
         raise OSError(errno.ENOSPC, f"imagename = '{imagename}', imsize = {list(shape)}: {space}; free some, or choose "
                                     "another folder")
 
 
-def _bytes_needed(shape):
-    """Return the size of all products: pixels, masks, and what is around them."""
-    return (len(PRODUCTS) * 4 + 3) * math.prod(shape) + 2_000_000
+def _bytes_needed(shape, more=0):
+    """Return the size of all products and `more` images: pixels, masks, and what is around them."""
+    return ((len(PRODUCTS) + more) * 4 + 3 + more) * math.prod(shape) + 2_000_000
 
 
 def _folder_of(imagename, stage):
@@ -158,36 +161,39 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     OSError
         The images could not be written, as on a full disk; everything is as it was before.
     """
-    check_imagename(output.imagename, plane.shape)  # the disk may have filled up since the run began
+    more = 2 * output.pbcor
+    check_imagename(output.imagename, plane.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
             in_child("products", child, root=root, plane=vars(plane), images=images, sumwt=float(sumwt), beam=beam,
-                     restoringbeam=output.restoringbeam, history=output.history)
+                     restoringbeam=output.restoringbeam, history=output.history, pbcor=output.pbcor)
             if record is not None:
                 jsonfile.save(root + RECORD, record)
             _sync(os.path.dirname(root))
         except (ChildError, OSError) as error:
-            raise _not_written(output.imagename, plane.shape, os.path.dirname(root), error) from error
+            raise _not_written(output.imagename, _bytes_needed(plane.shape, more), os.path.dirname(root), error) from error
 
 
-def write_images(root, plane, images, sumwt, beam, restoringbeam, history):
+def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor=False):
     """Write the images under the name `root`: what `write_products` has a child process do."""
     plane = ImagePlane(**plane)
     write_image(root + ".psf", images["psf"], plane, beam=beam)
-    write_image(root + ".residual", images["residual"], plane, masked=True)
+    write_image(root + ".residual", images["residual"], plane, masked=plane.masks_all)
     write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
     write_image(root + ".pb", plane.pb, plane, masked=True)
     write_image(root + ".sumwt", np.array([[sumwt]], np.float32), plane)
     if restoringbeam is not None:
         restore(root, restoringbeam)
+    if pbcor:
+        write_corrected(root, plane, images["model"])
     for path in existing_products(root):
         with opened("image", path) as ia:
             ia.sethistory(origin="tsara", history=list(history))
 
 
-def _not_written(imagename, shape, scratch, error):
+def _not_written(imagename, needed, scratch, error):
     """Return the error that says why the images were not written: a full disk, or in CASA's words."""
-    folder, needed, free = os.path.dirname(imagename) or ".", _bytes_needed(shape), shutil.disk_usage(scratch).free
+    folder, free = os.path.dirname(imagename) or ".", shutil.disk_usage(scratch).free
     written = sum(os.lstat(os.path.join(parent, name)).st_blocks * 512
                   for parent, _, names in os.walk(scratch) for name in names)
     if free + written < needed:

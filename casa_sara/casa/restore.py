@@ -1,15 +1,18 @@
-"""Restoring beam and restored image, made by the code behind tclean."""
+"""Restoring beam and restored image, made by the code behind tclean; images divided by the primary beam."""
 
 from __future__ import annotations
 
 import math
 import os
 
+import numpy as np
+
+from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.images import write_image
 from casa_sara.casa.quantities import radians
 from casa_sara.casa.tools import opened, scratch_folder
 
-__all__ = ["fit_beam", "restore", "restoring_beam_words"]
+__all__ = ["fit_beam", "restore", "restoring_beam_words", "write_corrected"]
 
 PSF_CUTOFF = 0.35  # of tclean: the Gaussian is fitted to the PSF above this fraction of its peak
 
@@ -108,3 +111,21 @@ def restore(root, restoringbeam=()):
         deconvolver.restore()
     finally:
         deconvolver.done()
+
+
+def write_corrected(root, plane, model):
+    """Write `root`.image.pbcor and `root`.model.pbcor: what was seen, divided by the primary beam.
+
+    Below the limit of the primary beam they are zero and masked, as tclean's .image.pbcor. Needs `root`.image.
+
+    Parameters
+    ----------
+    root : str
+    plane : ImagePlane
+    model : float32 (nx, ny), Jy/pixel
+    """
+    with opened("image", root + ".image") as ia:
+        image, beam = read_pixels(ia), ia.restoringbeam()
+    for name, pixels, unit, beam in ((".image", image, "Jy/beam", beam), (".model", model, "Jy/pixel", None)):
+        corrected = np.divide(pixels, plane.pb, out=np.zeros_like(pixels), where=plane.mask)
+        write_image(f"{root}{name}.pbcor", corrected, plane, unit=unit, beam=beam, masked=True)

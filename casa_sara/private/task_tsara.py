@@ -39,7 +39,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"]:
         return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
-    check_imagename(parameters["imagename"], grid.shape)
+    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"])
     with one_run_of(parameters["imagename"]):
         recover_products(parameters["imagename"])
         output = _output(parameters)
@@ -152,7 +152,8 @@ def _output(parameters):
                               "overwrite = True to replace them, or restart = True to continue from the model")
     beam = tuple(restoring_beam_words(parameters["restoringbeam"])) if parameters["restoration"] else None
     return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"], images_stand,
-                  tuple(history_lines("tsara", parameters)), parameters["restart"] and unfinished)
+                  tuple(history_lines("tsara", parameters)), parameters["restart"] and unfinished,
+                  parameters["pblimit"], parameters["pbcor"])
 
 
 def _model_to_continue(imagename, startmodel, old):

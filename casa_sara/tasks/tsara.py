@@ -24,12 +24,14 @@ PARAMETERS = (
     Parameter('startmodel', ('string',), '', 'Name of starting model image'),
     Parameter('specmode', ('string',), 'mfs', 'Spectral definition mode', allowed=('mfs',)),
     Parameter('reffreq', ('string',), '', 'Reference frequency', opener='specmode', open_on=('mfs',)),
+    Parameter('pblimit', ('double',), 0.2, 'PB gain level at which to cut off normalizations', minimum=-1.0, maximum=1.0),
     Parameter('weighting', ('string',), 'natural', 'Weighting scheme of the psf, residual and restored images (natural, uniform, briggs)', allowed=('natural', 'uniform', 'briggs')),
     Parameter('robust', ('double',), 0.5, 'Robustness parameter', minimum=-2.0, maximum=2.0, opener='weighting', open_on=('briggs',)),
     Parameter('npixels', ('int',), 0, 'Number of pixels to determine uv-cell size', minimum=0.0, opener='weighting', open_on=('briggs',)),
     Parameter('uvtaper', ('stringVec',), [], 'uv-taper on outer baselines in uv-plane', opener='weighting', open_on=('natural', 'uniform', 'briggs')),
     Parameter('restoration', ('bool',), True, 'Do restoration steps (or not)'),
     Parameter('restoringbeam', ('string', 'stringVec'), [], 'Restoring beam shape to use. Default is the PSF main lobe', opener='restoration', open_on=(True,)),
+    Parameter('pbcor', ('bool',), False, 'Apply PB correction on the output restored image', opener='restoration', open_on=(True,)),
     Parameter('niter', ('int',), 100000, 'Maximum number of iterations; 0 makes dirty images only', minimum=0.0),
     Parameter('wavelets', ('stringVec',), ['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], 'Bases in which the sky is sparse together', allowed=('dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8')),
     Parameter('wavelevels', ('int',), 4, 'Levels of the wavelet transforms', minimum=1.0),
@@ -160,6 +162,12 @@ class _tsara:
           out/try.image     model convolved with the restoring beam, plus residual (Jy/beam)
           out/try.pb        the primary beam
           out/try.sumwt     the sum of the imaging weights
+        with pbcor=True
+          out/try.image.pbcor  the restored image divided by the primary beam
+          out/try.model.pbcor  the model divided by the primary beam
+        with a mask
+          out/try.mask      1 where the model may be other than zero, 0 elsewhere
+        and always
           out/try.sara.json the record 'sara' of the returned dictionary, with every iteration
         and, as long as the run has not finished, out/try.checkpoint, from which restart=True goes on.
         Images that exist are left alone, and the task refuses to start, unless restart or
@@ -209,6 +217,12 @@ class _tsara:
         The frequency on the spectral axis of the images. '' takes the middle of the selected range.
         Example: reffreq='8.4GHz'
 
+    pblimit : float, default 0.2
+        Where the primary beam is below this, .pb is zero, and .pb, .residual, .image and the images
+        that pbcor makes have no valid pixels (mask0), as in tclean. With a negative number its
+        absolute value does so for .pb and the images of pbcor only, and .residual and .image are
+        valid everywhere. The model is not cut off; usemask='pb' does that.
+
     weighting : {'natural', 'uniform', 'briggs'}, default 'natural'
         Imaging weights of .psf, .residual and .image, as in tclean:
           'natural'  the weights of the data
@@ -242,6 +256,12 @@ class _tsara:
         the same resolution.
         Examples: restoringbeam='0.3arcsec'
                   restoringbeam=['8arcsec', '10arcsec', '45deg']
+
+    pbcor : bool, default False
+        Opened by restoration = True.
+        True makes imagename.image.pbcor, which is .image divided by .pb, and imagename.model.pbcor,
+        .model divided by .pb: brightness on the sky, where all other images show what the antennas
+        see of it. Below pblimit both are zero and masked.
 
     niter : int, default 100000
         An upper limit, so large by default that the data decide when to stop. One iteration is one
@@ -431,8 +451,8 @@ class _tsara:
     def __call__(
         self, vis='', selectdata=True, field='', spw='', timerange='', uvrange='', antenna='', scan='', observation='',
         intent='', datacolumn='corrected', imagename='', imsize=[100], cell=[], phasecenter='', stokes='I',
-        projection='SIN', startmodel='', specmode='mfs', reffreq='', weighting='natural', robust=0.5, npixels=0,
-        uvtaper=[], restoration=True, restoringbeam=[], niter=100000,
+        projection='SIN', startmodel='', specmode='mfs', reffreq='', pblimit=0.2, weighting='natural', robust=0.5,
+        npixels=0, uvtaper=[], restoration=True, restoringbeam=[], pbcor=False, niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
         precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
         l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003,
