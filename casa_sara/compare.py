@@ -18,9 +18,11 @@ from casa_sara.casa.imagesets import check_same_data, data_names, read_frames, r
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.skyimage import SkyPlane, beam_numbers, read_sky_image
+from casa_sara.casa.spectrum import with_spectrum
 from casa_sara.casa.weights import dirty_image, imaging_weights
-from casa_sara.injection import Injection, can_be_repeated, recover
-from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.injection import Injection, can_be_repeated, recover, spectral_index_of
+from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.widefield import WTerm
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
 from casa_sara.visibilities import snapshot_blocks
 
@@ -28,6 +30,7 @@ __all__ = ["compare_images"]
 
 INJECTED = 100.0  # flux of an injected source, in units of the noise per beam with natural weights
 IMAGE_EPS = 1e-6  # accuracy of the residual images
+SMALLEST_W_PHASE = 0.01  # rad, in the corners of the image, that is worth the w-term
 LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a word
 ARCSEC = np.radians(1 / 3600)
 RADESYS = {"J2000": "FK5", "ICRS": "ICRS", "B1950": "FK4", "B1950_VLA": "FK4"}
@@ -64,7 +67,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     if RADESYS[first.plane.frame] == "FK4":
         notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
     frames = read_frames(request.frames, first.plane)
-    observed = _Observed(selection, first.plane, request, notes) if selection else None
+    observed = _Observed(selection, first.plane, request, sets, notes) if selection else None
     # one grid
     plane = observed.plane if observed else first.plane
     models = {one.name: _on_grid(one.model, plane, first, "models", notes) for one in sets}
@@ -86,7 +89,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         residuals, chi_square = {}, {}
         notes.extend(_other_data(sets, selection))
         for one in sets:
-            left = observed.minus(one.model, models[one.name])
+            left = observed.minus(one, models[one.name])
             residuals[one.name], chi_square[one.name] = observed.images(left), observed.chi_square(left)
     else:
         check_same_data(sets)
@@ -243,11 +246,12 @@ class _Observed:
         Weighting → major, minor in arcsec and position angle in degrees, fitted to the PSF.
     """
 
-    def __init__(self, selection, plane, request, notes):
+    def __init__(self, selection, plane, request, sets, notes):
         longitude, latitude = (float(angle) for angle in plane.centre)
         grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
-        data = read_visibilities(selection, grid.phasecenter)
+        data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
         notes.extend(data.notes)
+        self._gridder = _common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)
         self.plane, self._data, self._nthreads = SkyPlane(image_plane.csys, plane.shape), data, request.nthreads
         self._operators = {}
@@ -271,21 +275,41 @@ class _Observed:
         power = self._data.weight * np.abs(left) ** 2
         return np.bincount(self._block_of_sample, power, self._samples.size) / (2 * self._samples)
 
-    def minus(self, image, model):
-        """Return the data minus the visibilities of a model, given as it was made and on the common grid.
+    def minus(self, one, model):
+        """Return the data minus the visibilities of a product's model, which is given on the common grid.
 
-        They are predicted from its own pixels where these have the common centre: regridding would blur it.
+        They are predicted from its own pixels where these have the common centre: regridding would blur it. A model of a
+        known spectral index keeps its spectrum.
         """
+        image = one.model
         plane, pixels = (image.plane, image.pixels) if image.is_aligned(self.plane) else (self.plane, model)
-        operator = self._operator(plane, f"models: '{image.name}'")
+        operator = self._operator(plane, f"models: '{image.name}'", spectral_index_of(one), image.plane)
         return self._data.vis - operator.forward(np.asarray(pixels, np.float32))
 
-    def _operator(self, plane, what):
-        key = plane.shape, plane.cell_rad
+    def _operator(self, plane, what, spectralindex="", reference=None):
+        key = plane.shape, plane.cell_rad, spectralindex
         if key not in self._operators:
+            grid = ImageGrid(plane.shape, plane.cell_rad, gridder=self._gridder, spectralindex=spectralindex)
+            if spectralindex:  # at the frequency of the model, not at that of the common grid
+                grid = with_spectrum(grid, plane, reference)
             try:
-                self._operators[key] = MeasurementOperator(self._data.uvw[:2], plane.cell_rad, plane.shape,
-                                                           eps=IMAGE_EPS, nthreads=self._nthreads)
+                self._operators[key] = sky_operator(self._data.uvw, grid, self._data.freq_hz, eps=IMAGE_EPS,
+                                                    nthreads=self._nthreads)
             except ValueError as error:
                 raise ValueError(f"{what}: its pixels cannot be held against vis: {error}") from error
         return self._operators[key]
+
+
+def _common_gridder(sets, max_w, plane, notes):
+    """Return with which measurement operator all products are held against the visibilities, and say why.
+
+    That is without the w-term where all were imaged without it, or where it is nothing; else with it.
+    """
+    phase = WTerm.of(max_w, plane.shape, plane.cell_rad, IMAGE_EPS).phase
+    without = [one.name for one in sets if one.parameters.get("gridder", "") == "standard"
+               or one.parameters.get("taskname") == "tsara" and "gridder" not in one.parameters]
+    if len(without) == len(sets) or phase < SMALLEST_W_PHASE:
+        return "standard"
+    notes.append(f"the residuals of all are made with the w-term, which turns phases by up to {phase:.2g} rad in this image"
+                 + "".join(f"; '{name}' was imaged without it" for name in without))
+    return "wproject"

@@ -7,11 +7,13 @@ from dataclasses import dataclass, replace
 
 from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
+from casa_sara.operators.sky import further_bytes
 
 __all__ = ["Forecast", "Workload", "forecast"]
 
 # bytes of one visibility; docs/reliability.md, "Forecast", has the measurement
 SAMPLE = 46  # Visibilities: vis, two weights, uvw, row, chan
+FREQUENCY = 4  # of a sample, where they are kept
 READING = 62  # chunks, and one column joined
 POINT = 28  # of the operator: NonUniformFFT's Points
 PLANNING = 64  # frequencies and factors, while the operator is built
@@ -27,7 +29,11 @@ REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one 
 
 @dataclass(frozen=True)
 class Workload:
-    """What memory depends on; `reach` is the largest |u| and |v| in wavelengths."""
+    """What memory depends on; `reach` is the largest |u| and |v| in wavelengths, `max_w` the largest |w|.
+
+    `frequencies` tells whether the samples keep theirs, for a spectral index; `band` is the largest |ln(ν/ν0)| where that is an
+    image, else 0.
+    """
 
     samples: int
     reach: tuple[float, float]
@@ -39,19 +45,25 @@ class Workload:
     nthreads: int
     precondition: bool = True
     report: bool = False
+    gridder: str = "standard"
+    max_w: float = 0.0
+    frequencies: bool = False
+    band: float = 0.0
 
     @classmethod
-    def of(cls, census, grid, options, report=False):
+    def of(cls, census, grid, options, report=False, band=0.0):
         """The workload of a census of the data and the task's parameters."""
         return cls(census.samples, census.reach, grid.shape, grid.cell_rad, len(options.wavelets), options.wavelevels,
-                   options.niter, options.nthreads, options.precondition, report)
+                   options.niter, options.nthreads, options.precondition, report, grid.gridder, census.max_w,
+                   bool(grid.spectralindex), band)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
-        data = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples}
+        data = {"libraries": LIBRARIES, "visibilities": (SAMPLE + FREQUENCY * self.frequencies) * self.samples}
         phases = {"reading": data | {"while reading": READING * self.samples}}
         data["image planes"] = self._planes(PLANE)
-        operator = data | {"operator": POINT * self.samples + self._grid()}
+        plain, further = POINT * self.samples + self._grid(), further_bytes(self.samples, self, self.max_w, self.band)
+        operator = data | {"operator": plain + further}
         solver = operator | {"solver's visibilities": SOLVER * self.samples}
         if self.niter > 0:
             if self.precondition:
@@ -65,6 +77,8 @@ class Workload:
                 "wavelet duals and weights": 2 * coefs, "wavelet workspace": workspace}
         phases["writing"] = operator | {"while planning": PLANNING * self.samples,
                                         "image planes": self._planes(PLANE + WRITING)}
+        if self.frequencies:
+            phases["writing"]["operator of flat spectra"] = plain + further_bytes(self.samples, self, self.max_w)
         if self.report:
             phases["report"] = operator | {"drawing": REPORT + REPORT_SAMPLE * self.samples,
                                            "image planes": self._planes(REPORT_PLANES)}

@@ -15,13 +15,16 @@ from casa_sara.casa.modelcolumn import save_model_column, write_model_column
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
+from casa_sara.casa.spectrum import with_spectrum
 from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
 from casa_sara.deadline import Deadline
 from casa_sara.noise import noise_from_differences
-from casa_sara.operators.measurement import MeasurementOperator, check_cell, check_field
-from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
-from casa_sara.reconstruction import Reconstruction, schedule_of
+from casa_sara.operators.measurement import check_cell, check_field
+from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.widefield import WTerm
+from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Spectrum, Weighting
+from casa_sara.reconstruction import Reconstruction, operator_accuracy, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import UNFINISHED
 from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
@@ -83,9 +86,10 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if output.resume:
         checkpoint.open()
     # read
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
     data.notes.extend(_limits(data, grid))
     plane = define_image_plane(data, selection, grid, output.pblimit)
+    grid = with_spectrum(grid, plane)
     if not plane.mask.any():
         data.notes.append(f"phasecenter = '{grid.phasecenter}': the primary beam is nowhere in the image above pblimit = "
                           f"{output.pblimit:g}, and its pixels are masked everywhere")
@@ -101,6 +105,8 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise = noise_from_differences(data, offsets)
     _describe(data, blocks, noise)
+    if grid.gridder == "wproject":
+        log.info(WTerm.of(data.max_w, grid.shape, grid.cell_rad, operator_accuracy(data, offsets, noise)).words)
     _point_spread(data, grid, weighting, options, plane)  # what cannot be weighed or restored is refused before the hours
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
@@ -114,7 +120,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # write
     with waiting_child() as child:  # which starts meanwhile
         weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
-        residual = dirty_image(operator, data.vis - operator.forward(model), weights)
+        residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model), weights)
         images = dict(psf=psf, residual=residual, model=model)
         result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()),
                         float(model.sum(dtype=float)), forecast.summary())
@@ -131,14 +137,16 @@ def _save_model(selection, data, grid, options, model):
     """Write the model's visibilities into the MeasurementSets: the last phase, the images are whole."""
     log.info("writing the model column")
     save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
-                      cell_rad=grid.cell_rad, nthreads=options.nthreads, model=model)
+                      cell_rad=grid.cell_rad, gridder=grid.gridder, spectrum=grid.spectrum and asdict(grid.spectrum),
+                      nthreads=options.nthreads, model=model)
 
 
-def write_column(selection, phase_center, cell_rad, nthreads, model):
+def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads, model):
     """Predict the visibilities of a model and write them: what `save_model_column` has a child process do."""
     chosen = {name: tuple(value) if isinstance(value, list) else value for name, value in selection.items()}
-    write_model_column(Selection(**chosen), phase_center, lambda uvw: MeasurementOperator(
-        uvw[:2], cell_rad, model.shape, eps=IMAGE_EPS, nthreads=nthreads).forward(model))
+    grid = ImageGrid(model.shape, tuple(cell_rad), gridder=gridder, spectrum=spectrum and Spectrum(**spectrum))
+    write_model_column(Selection(**chosen), phase_center, lambda uvw, freq_hz: sky_operator(
+        uvw, grid, freq_hz, eps=IMAGE_EPS, nthreads=nthreads).forward(model))
 
 
 def _peak(name):
@@ -147,10 +155,17 @@ def _peak(name):
         return float(np.abs(read_pixels(ia)).max())
 
 
+def _predicted(operator, data, grid, options, model):
+    """Return the visibilities of a model, by the operator of the dirty images unless there is a spectrum."""
+    if grid.spectrum is not None:
+        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads)
+    return operator.forward(model)
+
+
 def _point_spread(data, grid, weighting, options, plane):
-    """Return the imaging weights, the operator of the dirty images, the PSF and the beam fitted to it."""
+    """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and the beam fitted to it."""
     weights = imaging_weights(data, grid, weighting)
-    operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
+    operator = sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads)
     psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
     return weights, operator, psf, fit_beam(psf, plane)
 
@@ -167,8 +182,9 @@ def _limits(data, grid):
                      f"sources between pixels cannot be represented; 5 would be cell = '{arcsec * pixels / 5:.3g}arcsec'")
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
     phase = np.pi * data.max_w * corner_sq
-    if phase > LARGEST_W_PHASE:
-        notes.append(f"the w-term is not modelled: it turns phases by up to {phase:.2g} rad in the corners of this image")
+    if phase > LARGEST_W_PHASE and grid.gridder == "standard":
+        notes.append(f"the w-term is not modelled: it turns phases by up to {phase:.2g} rad in the corners of this image; "
+                     "gridder = 'wproject' models it")
     return notes
 
 

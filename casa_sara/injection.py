@@ -12,13 +12,14 @@ from casa_sara.casa import log
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.regrid import PixelMap
 from casa_sara.casa.skyimage import SkyPlane
+from casa_sara.casa.spectrum import with_spectrum
 from casa_sara.noise import noise_from_differences
 from casa_sara.options import ImageGrid, Selection, SolverOptions
 from casa_sara.solver.record import STOPPED_BY_USER
 from casa_sara.solving import solve_image
 from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
 
-__all__ = ["Injection", "can_be_repeated", "recover"]
+__all__ = ["Injection", "can_be_repeated", "recover", "spectral_index_of"]
 
 ARCSEC = np.radians(1 / 3600)
 
@@ -39,6 +40,11 @@ class Injection:
 def can_be_repeated(one) -> bool:
     """Tell whether the run that made an ImageSet can be repeated: it is tsara's, and the images say with what."""
     return one.parameters.get("taskname") == "tsara"
+
+
+def spectral_index_of(one) -> str:
+    """Return the spectral index that an ImageSet was imaged with, as its history has it, '' for flat spectra."""
+    return one.parameters.get("spectralindex", "")
 
 
 def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) -> dict[str, dict[str, float]]:
@@ -93,13 +99,15 @@ def _repeat(one, places, flux, selection, nthreads):
     """Return the models of the same run on the visibilities as they are, and with the sources."""
     plane = one.model.plane
     longitude, latitude = (float(angle) for angle in plane.centre)
-    grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad",
+                     gridder=one.parameters.get("gridder", "standard"), spectralindex=spectral_index_of(one))
+    grid = with_spectrum(grid, plane)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
     block_of_sample, _ = snapshot_blocks(data, _value(one.parameters.get("blocks", "0"), 0))
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise, options = noise_from_differences(data, offsets), _options(one.parameters, nthreads)
     models = []
-    for vis in (data.vis, data.vis + _visibilities(places, flux, data.uvw, plane)):
+    for vis in (data.vis, data.vis + _visibilities(places, flux, data, grid)):
         solved = solve_image(replace(data, vis=vis), offsets, noise, selection, grid, options)
         if solved.record.stop_code == STOPPED_BY_USER:  # half a run says nothing of the resolution
             raise KeyboardInterrupt
@@ -107,14 +115,22 @@ def _repeat(one, places, flux, selection, nthreads):
     return models
 
 
-def _visibilities(places, flux, uvw, plane):
-    """Return complex64 (M,), the visibilities of points at pixel coordinates."""
-    vis = np.zeros(uvw.shape[1], np.complex64)
+def _visibilities(places, flux, data, grid):
+    """Return complex64 (M,), the visibilities of points at pixel coordinates, with the spectrum that the model has there."""
+    vis = np.zeros(data.size, np.complex64)
     for x, y in places:
-        l, m = (plane.shape[0] // 2 - x) * plane.cell_rad[0], (y - plane.shape[1] // 2) * plane.cell_rad[1]
+        l, m = (grid.shape[0] // 2 - x) * grid.cell_rad[0], (y - grid.shape[1] // 2) * grid.cell_rad[1]
         towards = np.array([l, m, np.sqrt(1 - l**2 - m**2) - 1])
-        vis += flux * np.exp(2j * np.pi * (towards @ uvw))
+        vis += flux * _spectrum_at(x, y, data, grid) * np.exp(2j * np.pi * (towards @ data.uvw))
     return vis
+
+
+def _spectrum_at(x, y, data, grid):
+    """Return (ν/ν0)^α of each sample at a pixel, 1 where no spectral index was given."""
+    if grid.spectrum is None:
+        return 1.0
+    index = np.asarray(grid.spectrum.index)
+    return (data.freq_hz.astype(float) / grid.spectrum.reference_hz) ** float(index[round(x), round(y)] if index.ndim else index)
 
 
 def _options(parameters, nthreads) -> SolverOptions:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-__all__ = ["Comparing", "ImageGrid", "Limits", "Output", "Selection", "SolverOptions", "Weighting"]
+__all__ = ["LARGEST_INDEX", "Comparing", "ImageGrid", "Limits", "Output", "Selection", "SolverOptions", "Spectrum",
+           "Weighting"]
+
+LARGEST_INDEX = 5.0  # spectral index of any continuum, plus or minus
 
 SARA_BASES = ("dirac", "db1", "db2", "db3", "db4", "db5", "db6", "db7", "db8")
 
@@ -43,8 +47,19 @@ class Selection:
 
 
 @dataclass(frozen=True)
+class Spectrum:
+    """I(ν) = I(ν0)·(ν/ν0)^α: the index α, one number or a real image (nx, ny), and ν0 = `reference_hz`, where the image is."""
+
+    index: Any
+    reference_hz: float
+
+
+@dataclass(frozen=True)
 class ImageGrid:
-    """The image plane: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive."""
+    """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
+
+    `spectrum` is what `spectralindex` stands for, once it has been read.
+    """
 
     shape: tuple[int, int]
     cell_rad: tuple[float, float]
@@ -52,6 +67,9 @@ class ImageGrid:
     projection: str = "SIN"
     stokes: str = "I"
     reffreq: str = ""
+    gridder: str = "standard"
+    spectralindex: str = ""
+    spectrum: Spectrum | None = None
 
 
 @dataclass(frozen=True)

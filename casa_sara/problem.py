@@ -8,6 +8,7 @@ import numpy as np
 
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.operators.norms import power_method
+from casa_sara.operators.sky import sky_operator
 from casa_sara.outliers import find_wild
 from casa_sara.solver.nnls import nnls
 from casa_sara.visibilities import Visibilities
@@ -67,8 +68,8 @@ class Problem:
         sqrt_weight = np.sqrt(data.weight)
         vis = data.vis * sqrt_weight
         sqrt_weight *= np.float32(unit_jy)
-        measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=sqrt_weight, eps=eps,
-                                          nthreads=options.nthreads)
+        measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=sqrt_weight, eps=eps,
+                                   nthreads=options.nthreads)
         precond = _preconditioner(samples.density, options.precondition)
         if data_norm_sq is None:
             data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),

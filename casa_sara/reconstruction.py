@@ -102,7 +102,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, eps=operator_accuracy(data, offsets, noise))
     if checkpoint is not None:
         checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, blocks=samples.offsets,
-                            density=density, noise=noise)
+                            density=density, noise=noise, spectralindex=grid.spectrum and np.asarray(grid.spectrum.index))
     if checkpoint is not None and checkpoint.state is not None:
         solution = _resume(samples, problem_of, options, noise, checkpoint)
     else:

@@ -7,7 +7,9 @@ import time
 
 from casa_sara.casa import log
 from casa_sara.casa.census import take_census
+from casa_sara.casa.imageplane import define_image_plane
 from casa_sara.casa.ms import read_visibilities
+from casa_sara.casa.spectrum import spectral_band, with_spectrum
 from casa_sara.forecast import Workload, forecast
 from casa_sara.operators.measurement import check_field
 from casa_sara.resources import available_memory, resident_memory
@@ -31,7 +33,7 @@ def foresee(selection, grid, options, limits):
         census = take_census(selection, flags)
         if any(census.reach):  # else there is nothing to read, which reading explains
             check_field(math.hypot(*census.reach), grid.shape, grid.cell_rad)
-        work = Workload.of(census, grid, options, limits.report)
+        work = Workload.of(census, grid, options, limits.report, spectral_band(grid, census.freq_range_hz))
         found = forecast(work, resident, available, limits.maxmem_gb)
         if found.fits:
             break
@@ -67,7 +69,9 @@ def rehearse(selection, grid, options, blocks, limits):
             log.warn(str(error))
             return found.summary() | {"reason": str(error)}
     start = time.perf_counter()
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
+    if grid.spectralindex:
+        grid = with_spectrum(grid, define_image_plane(data, selection, grid))
     data, offsets = sort_into_blocks(data, snapshot_blocks(data, blocks)[0])
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
     for line in _time_lines(timing):

@@ -39,7 +39,7 @@ def checkpoint_of(selection, grid, options, output):
     startmodel = output.startmodel if output.startmodel != output.imagename + ".model" else ""  # that of restart = True
     parameters = asdict(selection) | asdict(grid) | asdict(options) | dict(blocks=output.blocks, startmodel=startmodel)
     parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
-    for name in ("vis", "nthreads"):
+    for name in ("vis", "nthreads", "spectrum"):
         del parameters[name]
     return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
 

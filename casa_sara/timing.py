@@ -10,7 +10,7 @@ import numpy as np
 
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
-from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.operators.sky import sky_operator
 from casa_sara.reconstruction import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.nnls import NNLS_ITERATIONS, nnls
@@ -81,8 +81,7 @@ def measure(data, offsets, grid, options, reading):
     scale = np.sqrt(data.weight)
     vis = data.vis * scale
     eps = operator_accuracy(data, offsets, noise_from_differences(data, offsets))
-    measurement = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, row_scale=scale, eps=eps,
-                                      nthreads=options.nthreads)
+    measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=scale, eps=eps, nthreads=options.nthreads)
     building = time.perf_counter() - start
     image, precond = np.ones(grid.shape, np.float32), np.ones(data.size, np.float32)
     bound = float(data.weight.sum(dtype=float)) * math.prod(grid.shape)  # of the operator's squared norm

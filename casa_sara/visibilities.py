@@ -69,6 +69,8 @@ class Visibilities:
         MeasurementSet of which nothing is selected is missing here.
     observatory : str
         Name of the telescope, of the first row selected.
+    freq_hz : float32 (M,) or None
+        LSRK frequencies, where they were asked for.
     """
 
     vis: np.ndarray
@@ -85,6 +87,7 @@ class Visibilities:
     freq_range_hz: tuple[float, float] = (0.0, 0.0)
     spws: dict[int, tuple[int, ...]] = field(default_factory=dict)
     observatory: str = ""
+    freq_hz: np.ndarray | None = None
 
     @property
     def size(self) -> int:
@@ -94,6 +97,7 @@ class Visibilities:
     def take(self, index) -> Visibilities:
         """Return the samples numbered `index`, in that order; `rows` stays whole."""
         per_sample = ("vis", "weight", "imaging_weight", "uvw", "row", "chan")
+        per_sample += ("freq_hz",) if self.freq_hz is not None else ()
         return replace(self, **{name: np.take(getattr(self, name), index, axis=-1) for name in per_sample})
 
     @property

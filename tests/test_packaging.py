@@ -41,7 +41,7 @@ ROOMS = {
     "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
     "casa": {"casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
     "operators": {
-        "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "numba", "llvmlite", "pywt",
+        "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "ducc0", "numba", "llvmlite", "pywt",
     },
     "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
     "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},

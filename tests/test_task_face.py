@@ -26,6 +26,7 @@ NARROWER = "tsara does not do the others"
 SURER = "tclean lets anything through; a mistake is better found here"
 EXCEPTIONS = {
     ("datacolumn", "allowed"): SURER,
+    ("gridder", "allowed"): NARROWER,
     ("imagename", "types"): "one name; tclean's list is for outlier fields, its int an accident",
     ("imsize", "range"): SURER,
     ("niter", "default"): "an upper limit: the data decide when to stop",
@@ -42,6 +43,8 @@ EXCEPTIONS = {
     ("stokes", "allowed"): NARROWER,
     ("uvtaper", "default"): "[] as tclean's own in the shell; in Python tclean has ['']; both mean none",
     ("weighting", "allowed"): NARROWER,
+    ("wprojplanes", "default"): "tclean's 1 leaves the w-term out of gridder='wproject'; here -1, as no number is needed",
+    ("wprojplanes", "range"): SURER,
 }
 
 
@@ -281,8 +284,8 @@ def test_every_problem_is_named(received):
 
 
 def test_unknown_parameter_is_refused(received):
-    with pytest.raises(TypeError, match="gridder"):
-        tsara(**GOOD, gridder="standard")
+    with pytest.raises(TypeError, match="deconvolver"):
+        tsara(**GOOD, deconvolver="hogbom")
 
 
 def closing_and_opening(parameter):

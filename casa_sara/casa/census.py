@@ -27,10 +27,16 @@ class Census:
         Visibilities of Stokes I.
     reach : (float, float)
         Largest |u| and |v| in wavelengths.
+    max_w : float
+        Largest |w| in wavelengths.
+    freq_range_hz : (float, float)
+        Lowest and highest frequency of a channel's middle.
     """
 
     samples: int
     reach: tuple[float, float]
+    max_w: float = 0.0
+    freq_range_hz: tuple[float, float] = (0.0, 0.0)
 
 
 def take_census(selection, flags=False):
@@ -46,18 +52,20 @@ def take_census(selection, flags=False):
     -------
     Census
     """
-    samples, reach = 0, np.zeros(2)
+    samples, reach, freqs_hz = 0, np.zeros(3), []
     for ms in select_data(selection)[0]:
         with opened("table", ms.name) as tb:
             cross = tb.getcol("ANTENNA1") != tb.getcol("ANTENNA2")
-            metres = np.abs(tb.getcol("UVW")[:2])
+            metres = np.abs(tb.getcol("UVW"))
             metres[~(metres <= LONGEST_M)] = 0  # neither NaN nor what no baseline has
             for group in ms.groups:
                 rows = group.rows[cross[group.rows]]
                 samples += _unflagged(tb, rows, group) if flags else rows.size * group.channels.size
                 longest = metres[:, rows].max(axis=1, initial=0.0)
                 reach = np.maximum(reach, longest * group.freqs_hz.max() * _DOPPLER / SPEED_OF_LIGHT)
-    return Census(int(samples), (float(reach[0]), float(reach[1])))
+                freqs_hz += [float(group.freqs_hz.min()), float(group.freqs_hz.max())]
+    u, v, w = reach.tolist()
+    return Census(int(samples), (u, v), w, (min(freqs_hz, default=0.0), max(freqs_hz, default=0.0)))
 
 
 def _unflagged(tb, rows, group):

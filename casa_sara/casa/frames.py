@@ -191,6 +191,10 @@ class Geometry:
         shift = (rotated[2] - uvw_m[2])[:, None] * wave_number if turned else None
         return rotated[:, :, None] * wave_number, shift
 
+    def frequencies(self, group, field, time):
+        """Return the LSRK frequencies, float64 (R, C) in Hz, of rows as :meth:`wavelengths` takes them."""
+        return group.freqs_hz * self._lsrk_factors(group.frame, field, time)[:, None]
+
     def _note_range(self, group, factors):
         """Widen `freq_range_hz` to the channels of these rows."""
         low, high = (group.freqs_hz - group.widths_hz / 2).min(), (group.freqs_hz + group.widths_hz / 2).max()

@@ -109,8 +109,8 @@ def write_model_column(selection, phase_center, predict):
     phase_center : dict
         Direction of the image centre, `Visibilities.phase_center`.
     predict : callable
-        Takes uvw float64 (3, M) in wavelengths and returns the complex (M,) visibilities in Jy
-        of the model image, at the image's phase centre.
+        Takes uvw float64 (3, M) in wavelengths and LSRK frequencies (M,) in Hz, and returns the complex (M,)
+        visibilities in Jy of the model image, at the image's phase centre.
 
     Raises
     ------
@@ -222,7 +222,9 @@ def _write(ms, geometry, predict):
                 usable = np.isfinite(uvw_m).all(axis=0)
                 model = np.zeros((rows.size, group.channels.size), dtype=complex)
                 field, time = part.getcol("FIELD_ID")[usable], part.getcol("TIME")[usable]
-                model[usable] = _at_field_centre(predict, *geometry.wavelengths(group, field, time, uvw_m[:, usable]))
+                freq_hz = geometry.frequencies(group, field, time)
+                model[usable] = _at_field_centre(predict, freq_hz,
+                                                 *geometry.wavelengths(group, field, time, uvw_m[:, usable]))
                 values = part.getcolslice(_COLUMN, *_corners(group))
                 selected = np.zeros((values.shape[0], group.channels.size, rows.size), dtype=complex)
                 selected[_parallel(group)] = model.T
@@ -239,9 +241,9 @@ def _parallel(group):
     return [k for k, name in enumerate(group.correlations) if name in ("I", "RR", "LL", "XX", "YY")]
 
 
-def _at_field_centre(predict, uvw, shift):
+def _at_field_centre(predict, freq_hz, uvw, shift):
     """Predict, and turn the visibilities back from the image's phase centre to the field's."""
-    model = np.asarray(predict(uvw.reshape(3, -1))).reshape(uvw.shape[1:])
+    model = np.asarray(predict(uvw.reshape(3, -1), freq_hz.reshape(-1))).reshape(uvw.shape[1:])
     return model if shift is None else model * np.exp(2j * np.pi * shift)
 
 

@@ -30,7 +30,7 @@ _ROW_COLUMNS = {
 _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64}
 
 
-def read_visibilities(selection, phasecenter="", stokes="I"):
+def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
     """Read, select, flag, average to Stokes I and turn to one phase centre.
 
     V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one hand there is. A sample is left out
@@ -52,6 +52,8 @@ def read_visibilities(selection, phasecenter="", stokes="I"):
         Image centre in tclean's words; '' is the first selected field's.
     stokes : str
         Only 'I'.
+    frequencies : bool
+        Keep the frequency of each sample.
 
     Returns
     -------
@@ -67,7 +69,7 @@ def read_visibilities(selection, phasecenter="", stokes="I"):
     selected, notes = select_data(selection)
     image = image_direction(phasecenter, selected)
     _check_directions(phasecenter, image, selected)
-    table = _SampleTable()
+    table = _SampleTable(frequencies)
     low, high, unused = np.inf, 0.0, []
     for ms in selected:
         geometry = Geometry(ms, image)
@@ -157,11 +159,12 @@ def _weight_column(tb, group):
 class _SampleTable:
     """The usable samples of all chunks so far."""
 
-    def __init__(self):
+    def __init__(self, frequencies):
         self.usable = Usability()
         self.size = 0
         self._rows_so_far = 0
         self._samples = {name: [] for name in ("vis", "weight", "imaging_weight", "uvw", "row", "chan")}
+        self._samples |= {"freq_hz": []} if frequencies else {}
         self._rows = {name: [] for name in RowTable.__dataclass_fields__}
 
     def add(self, chunk, ms, group, geometry):
@@ -185,6 +188,8 @@ class _SampleTable:
             "row": np.repeat(number, ok.sum(axis=1)).astype(np.int32),
             "chan": channel[ok].astype(np.int16),
         }
+        if "freq_hz" in self._samples:
+            new["freq_hz"] = geometry.frequencies(group, columns["field"], columns["time"])[ok].astype(np.float32)
         for name, values in new.items():
             self._samples[name].append(values)
         of_group = {name: np.full(kept.size, value) for name, value in (("ms", ms.number), ("spw", group.spw))}

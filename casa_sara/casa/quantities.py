@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["check_frequency", "radians", "seconds"]
+__all__ = ["check_frequency", "hertz", "radians", "seconds"]
 
 
 def radians(text, parameter):
@@ -45,6 +45,17 @@ def check_frequency(text, parameter):
     """Raise ValueError unless `text` is a frequency, as '1.4GHz'."""
     if not _is(text, "Hz"):
         raise ValueError(f"{parameter} = '{text}' is not a frequency: it takes a number with its unit, as '1.4GHz'")
+
+
+def hertz(text, parameter):
+    """Return the frequency `text`, as '1.4GHz', in Hz; raise ValueError unless it is positive."""
+    check_frequency(text, parameter)
+    import casatools
+
+    value = casatools.quanta().convert(text, "Hz")["value"]
+    if not 0 < value < math.inf:
+        raise ValueError(f"{parameter} = '{text}' should be a positive frequency, as '1.4GHz'")
+    return value
 
 
 def _is(text, unit):

@@ -68,4 +68,5 @@ def kernel_polynomial(width, beta, degree):
     t = np.cos((np.arange(4 * degree) + 0.5) * np.pi / (4 * degree))
     x = np.arange(width) + (1 - t[:, None]) / 2 - width / 2
     fit = np.polynomial.chebyshev.chebfit(t, kernel(2 * x / width, beta), degree)
-    return np.stack([np.polynomial.chebyshev.cheb2poly(column) for column in fit.T], axis=1)[::-1]
+    powers = [np.polynomial.chebyshev.cheb2poly(column) for column in fit.T]  # without zeros at the end
+    return np.stack([np.pad(row, (0, degree + 1 - row.size)) for row in powers], axis=1)[::-1]

@@ -15,8 +15,9 @@ from casa_sara.casa.modelcolumn import check_model_column_writable, incomplete_c
 from casa_sara.casa.products import (
     CHECKPOINT, REPORT, check_imagename, existing_products, history_lines, recover_products,
 )
-from casa_sara.casa.quantities import radians, seconds
+from casa_sara.casa.quantities import hertz, radians, seconds
 from casa_sara.casa.restore import restoring_beam_words
+from casa_sara.casa.spectrum import check_spectral_index
 from casa_sara.imaging import make_image
 from casa_sara.options import Comparing, ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
 from casa_sara.private.summary import summary
@@ -84,10 +85,25 @@ def selection_of(parameters: dict[str, Any]) -> Selection:
 
 
 def _grid(parameters):
+    planes = parameters["wprojplanes"]
+    if planes in (0, 1):
+        raise ValueError(f"wprojplanes = {planes}: would leave the w-term out, which gridder = 'standard' does; should be "
+                         "-1, or 2 or more")
+    if planes > 1:
+        log.info(f"wprojplanes = {planes}: the w-term is exact to the tolerance, and needs no planes")
     shape = _pair(parameters["imsize"], "imsize", "one number of pixels, or two")
     cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
-                     parameters["stokes"], parameters["reffreq"])
+                     parameters["stokes"], parameters["reffreq"], parameters["gridder"], _spectral_index(parameters))
+
+
+def _spectral_index(parameters):
+    """The spectral index as text, a number or the name of an image."""
+    text = str(parameters["spectralindex"])
+    check_spectral_index(text)
+    if text and parameters["reffreq"]:
+        hertz(parameters["reffreq"], "reffreq")
+    return text
 
 
 def _pair(value, name, right):

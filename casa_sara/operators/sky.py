@@ -1,0 +1,95 @@
+"""The measurement operator that a sky and an image ask for: plain, with the w-term, with a spectrum.
+
+Where the brightness follows a power law of the frequency with a known index,
+
+    I(ν) = I(ν0)·(ν/ν0)^α,
+
+the image is that at ν0.  One α for the whole image is a factor on each sample; an image of α is a short sum of transforms
+(`modulated.py`), since (ν/ν0)^α = exp(c s) with s the place of α within its range.
+"""
+
+from __future__ import annotations
+
+from math import prod
+
+import numpy as np
+
+from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator
+from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
+from casa_sara.operators.widefield import WTerm, w_operator
+from casa_sara.options import LARGEST_INDEX
+
+__all__ = ["further_bytes", "sky_operator"]
+
+# bytes of one sample and of one pixel, beyond what the plain operator has
+SERIES_SAMPLE, SERIES_PIXEL = 16, 16  # rotation and one term; place, two polynomials and one image
+GRIDDER_SAMPLE, GRIDDER_PIXEL = 80, 80  # what it holds, and the grids and indices of a call
+
+
+def sky_operator(uvw, grid, freq_hz=None, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1):
+    """Return the measurement operator of an image.
+
+    Parameters
+    ----------
+    uvw : float64 (3, M)
+        Baselines in wavelengths.
+    grid : casa_sara.options.ImageGrid
+        `shape`, `cell_rad`, `gridder` and `spectrum` decide.
+    freq_hz : real (M,), optional
+        Frequencies; without them the sky is as bright at all frequencies as at the reference.
+    row_scale, eps, dtype, nthreads
+        As of :class:`casa_sara.operators.measurement.MeasurementOperator`, whose interface the result has.
+    """
+    spectrum = grid.spectrum if freq_hz is not None else None
+    if spectrum is None:
+        return _of_place(uvw, grid, row_scale, eps, dtype, nthreads)
+    ratio = np.log(np.asarray(freq_hz, np.float64) / spectrum.reference_hz)
+    if np.ndim(spectrum.index) == 0:
+        scale = np.exp(float(spectrum.index) * ratio)
+        return _of_place(uvw, grid, scale if row_scale is None else scale * row_scale, eps, dtype, nthreads)
+    if np.shape(spectrum.index) != grid.shape:
+        raise ValueError(f"spectralindex must have the shape {grid.shape} of the image, not {np.shape(spectrum.index)}")
+    # (ν/ν0)^α = (ν/ν0)^α0 exp(c s), with α = α0 + h s and c = h ln(ν/ν0)
+    low, high = float(np.min(spectrum.index)), float(np.max(spectrum.index))
+    middle, half = 0.5 * (low + high), 0.5 * (high - low)
+    terms = terms_needed(half * np.abs(ratio).max(), eps / 4, modified=True)
+    factors = bessel_factors(half * ratio, terms, modified=True, dtype=np.dtype(dtype))
+    factors *= np.exp(middle * ratio)
+    place = (np.asarray(spectrum.index, np.float64) - middle) / max(half, np.finfo(float).tiny)
+    base = _of_place(uvw, grid, row_scale, max(eps / 2, SMALLEST_EPS[np.dtype(dtype)]), dtype, nthreads)
+    return ModulatedOperator(base, place.astype(dtype), factors)
+
+
+def _of_place(uvw, grid, row_scale, eps, dtype, nthreads):
+    """The operator of a sky that does not change with frequency."""
+    if grid.gridder == "wproject":
+        return w_operator(uvw, grid.cell_rad, grid.shape, row_scale, eps, dtype, nthreads)
+    return MeasurementOperator(uvw[:2], grid.cell_rad, grid.shape, row_scale, eps, dtype, nthreads)
+
+
+def further_bytes(samples, grid, max_w=0.0, band=0.0, eps=1e-6):
+    """Memory of the operator beyond that of the plain one, in single precision.
+
+    Parameters
+    ----------
+    samples : int
+    grid : casa_sara.options.ImageGrid
+    max_w : float
+        Largest |w| in wavelengths.
+    band : float
+        Largest |ln(ν/ν0)|; 0 unless there is an image of the spectral index.
+    eps : float
+
+    Returns
+    -------
+    int
+    """
+    pixels, size = prod(grid.shape), 0
+    if grid.gridder == "wproject":
+        terms = WTerm.of(max_w, grid.shape, grid.cell_rad, eps).terms
+        size += (SERIES_SAMPLE + 4 * terms) * samples + SERIES_PIXEL * pixels if terms else \
+            GRIDDER_SAMPLE * samples + GRIDDER_PIXEL * pixels
+    if band > 0:
+        terms = terms_needed(LARGEST_INDEX * band, eps / 4, modified=True)
+        size += (SERIES_SAMPLE + 4 * terms) * samples + SERIES_PIXEL * pixels
+    return int(size)
