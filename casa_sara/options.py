@@ -44,7 +44,10 @@ class Selection:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """The image plane: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive."""
+    """The image: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive, and the spectral axis of a cube.
+
+    `start` and `width` are '', a channel number or a quantity; `nchan` is -1 where the data tell it.
+    """
 
     shape: tuple[int, int]
     cell_rad: tuple[float, float]
@@ -52,6 +55,19 @@ class ImageGrid:
     projection: str = "SIN"
     stokes: str = "I"
     reffreq: str = ""
+    specmode: str = "mfs"
+    nchan: int = -1
+    start: int | str = ""
+    width: int | str = ""
+    outframe: str = "LSRK"
+    veltype: str = "radio"
+    restfreq: tuple[str, ...] = ()
+    interpolation: str = "nearest"
+
+    @property
+    def is_cube(self) -> bool:
+        """Whether the image has a plane for each channel."""
+        return self.specmode == "cube"
 
 
 @dataclass(frozen=True)

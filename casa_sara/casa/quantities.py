@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["check_frequency", "radians", "seconds"]
+__all__ = ["check_frequency", "check_spectral", "radians", "seconds"]
 
 
 def radians(text, parameter):
@@ -45,6 +45,15 @@ def check_frequency(text, parameter):
     """Raise ValueError unless `text` is a frequency, as '1.4GHz'."""
     if not _is(text, "Hz"):
         raise ValueError(f"{parameter} = '{text}' is not a frequency: it takes a number with its unit, as '1.4GHz'")
+
+
+def check_spectral(text, parameter):
+    """Return 'Hz' or 'km/s', whichever fits a frequency or velocity as '1.42GHz' or '-10km/s'; raise ValueError for others."""
+    for unit in ("Hz", "km/s"):
+        if _is(text, unit):
+            return unit
+    raise ValueError(f"{parameter} = '{text}' is neither a channel number, a frequency nor a velocity: it takes 5, "
+                     "'1.42GHz' or '10km/s'")
 
 
 def _is(text, unit):

@@ -52,13 +52,13 @@ def fit_beam(psf, plane):
 
 
 def restoring_beam_words(restoringbeam):
-    """Return tclean's `restoringbeam` as a list of strings, empty for the fitted beam.
+    """Return tclean's `restoringbeam` as a list of strings, empty for the beam of each channel.
 
     Parameters
     ----------
     restoringbeam : str or sequence
-        '' or [] or 'common' (the same in an image of one channel), one angle for a circular
-        beam, or [major, minor, position angle].
+        '' or [] for the fitted one, 'common' for the smallest that holds those of all channels (the same in an image
+        of one channel), one angle for a circular beam, or [major, minor, position angle].
 
     Raises
     ------
@@ -68,7 +68,7 @@ def restoring_beam_words(restoringbeam):
     words = [restoringbeam] if isinstance(restoringbeam, str) else [str(word) for word in restoringbeam]
     words = [word.strip() for word in words if word.strip()]
     if words in ([], ["common"]):
-        return []
+        return words
     if len(words) not in (1, 3):
         raise ValueError(f"restoringbeam = {words} takes one angle, or [major, minor, position angle]")
     axes = [radians(word, "restoringbeam") for word in words[:2]]
@@ -79,7 +79,7 @@ def restoring_beam_words(restoringbeam):
     return words
 
 
-def restore(root, restoringbeam=()):
+def restore(root, restoringbeam=(), specmode="mfs"):
     """Write `root`.image = `root`.model ∗ beam + `root`.residual, in Jy/beam.
 
     The residual is smoothed to the beam too, as in tclean, when the beam is not the fitted
@@ -90,19 +90,22 @@ def restore(root, restoringbeam=()):
     root : str
     restoringbeam : str or sequence
         See `restoring_beam_words`.
+    specmode : str
+        'mfs' or 'cube'.
     """
     import casatools
 
+    words = restoring_beam_words(restoringbeam)
     deconvolver = casatools.synthesisdeconvolver()
     try:
         deconvolver.setupdeconvolution(
             {
                 "imagename": root,
                 "deconvolver": "hogbom",
-                "specmode": "mfs",
+                "specmode": specmode,
                 "usemask": "user",
                 "startmodel": "",
-                "restoringbeam": restoring_beam_words(restoringbeam),
+                "restoringbeam": words if specmode == "cube" or words != ["common"] else [],
             }
         )
         deconvolver.restore()
