@@ -20,9 +20,11 @@ PLANNING = 64  # frequencies and factors, while the operator is built
 SOLVER = 52  # whitened data, density, preconditioner, dual, Φx̄, Φz, spread, weights
 PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
 WEIGHING = 30  # uv cells and densities
+SORTING = 12  # of a cube: channels of the samples, and their order
 # image planes, each 4 bytes a pixel
 PLANE = 1.25  # primary beam and mask
 NORM, NNLS, SOLVING, WRITING = 8, 4, 10, 10
+CUBES = 3  # psf, residual and model of each channel
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
 REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one visibility, image planes
@@ -32,7 +34,7 @@ class Workload:
     """What memory depends on; `reach` is the largest |u| and |v| in wavelengths, `max_w` the largest |w|.
 
     `frequencies` tells whether the samples keep theirs, for a spectral index; `band` is the largest |ln(ν/ν0)| where that is an
-    image, else 0.
+    image, else 0. A cube has `channels`, and `share` of the samples are in the one with most.
     """
 
     samples: int
@@ -50,15 +52,33 @@ class Workload:
     frequencies: bool = False
     band: float = 0.0
 
+    channels: int = 0
+    share: float = 1.0
+
     @classmethod
-    def of(cls, census, grid, options, report=False, band=0.0):
+    def of(cls, census, grid, options, report=False, band=0.0, channels=0, share=1.0):
         """The workload of a census of the data and the task's parameters."""
         return cls(census.samples, census.reach, grid.shape, grid.cell_rad, len(options.wavelets), options.wavelevels,
                    options.niter, options.nthreads, options.precondition, report, grid.gridder, census.max_w,
-                   bool(grid.spectralindex), band)
+                   bool(grid.spectralindex), band, channels, share)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
+        return self._of_cube() if self.channels else self._of_plane()
+
+    def _of_cube(self):
+        """The phases of the fullest channel, beside all data and the cubes; all is read and written at once."""
+        one = replace(self, samples=math.ceil(self.samples * self.share), channels=0).memory()
+        one.pop("reading")
+        writing = one.pop("writing")
+        held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
+                "cubes": self._planes((PLANE + CUBES) * self.channels)}
+        reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples, "while reading": READING * self.samples}
+        return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
+                "images of a channel": writing | held,
+                "writing": {"libraries": LIBRARIES, **held, "image planes": self._planes(WRITING * self.channels)}}
+
+    def _of_plane(self):
         data = {"libraries": LIBRARIES, "visibilities": (SAMPLE + FREQUENCY * self.frequencies) * self.samples}
         phases = {"reading": data | {"while reading": READING * self.samples}}
         data["image planes"] = self._planes(PLANE)
@@ -138,16 +158,20 @@ class Forecast:
         """The memory as lines of a table, for the log."""
         work, parts = self.workload, self.phases[self.peak_phase]
         yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak, {self.peak_phase}, for "
-               f"{work.shape[0]} x {work.shape[1]} pixels and {work.samples} visibilities; "
+               f"{work.shape[0]} x {work.shape[1]} pixels{self._channels()} and {work.samples} visibilities; "
                f"{self.room / 1e6:.0f} MB may be taken in addition to the {self.resident / 1e6:.0f} MB held now")
         for part, size in parts.items():
             yield f"  {part:<26}{size / 1e6:10.1f} MB"
         yield f"  {'in all':<26}{self.needed / 1e6:10.1f} MB"
 
+    def _channels(self):
+        return f" in {self.workload.channels} channels" if self.workload.channels else ""
+
     def summary(self):
         """Return what the returned dictionary says of it: sizes in bytes."""
         return {
             "imsize": list(self.workload.shape),
+            **({"nchan": self.workload.channels} if self.workload.channels else {}),
             "visibilities": self.workload.samples,
             "peak_bytes": self.resident + self.needed,
             "held_before_bytes": self.resident,
@@ -166,7 +190,7 @@ class Forecast:
         least = self.resident + self.needed
         limit = f"maxmem = {maxmem_gb:g} GB" if maxmem_gb else "the memory available"
         raise MemoryError(
-            f"imsize = {list(self.workload.shape)} with the {self.workload.samples} visibilities of vis takes "
+            f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of vis takes "
             f"{least / 1e9:.2f} GB while {self.peak_phase} ({parts}, held now {self.resident / 1e9:.2f}); {limit} "
             f"allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
 
@@ -185,6 +209,9 @@ class Forecast:
         ways = []
         if part:
             ways.append(f"imsize up to {list(scaled(part).shape)}")
+        channels = int(work.channels * _largest(lambda x: needs(replace(work, channels=max(1, int(work.channels * x))))))
+        if channels:
+            ways.append(f"nchan up to {channels}")
         if samples:
             most = int(work.samples * samples)
             ways.append(f"at most {most} visibilities (select with spw, scan, …; or average them)")

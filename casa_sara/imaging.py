@@ -31,7 +31,9 @@ from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sort_into_blocks
 
-__all__ = ["Result", "make_image", "write_column"]
+__all__ = [
+    "PlaneImages", "Result", "Split", "describe", "image_limits", "make_image", "plane_images", "split", "write_column",
+]
 
 FEWEST_PIXELS = 3.0  # of the finest fringe
 LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
@@ -62,6 +64,35 @@ class Result:
         return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
 
 
+@dataclass
+class Split:
+    """The samples of one plane in the order of their blocks, and the noise of each block measured from the data."""
+
+    data: Visibilities
+    blocks: list[BlockInfo]
+    offsets: np.ndarray
+    noise: np.ndarray
+
+
+@dataclass
+class PlaneImages:
+    """The images of one plane: `pixels` are 'psf', 'residual' and 'model', float32 (nx, ny)."""
+
+    pixels: dict[str, np.ndarray]
+    sumwt: float
+    beam: dict
+
+    @property
+    def residual_peak(self) -> float:
+        """Largest absolute pixel of the residual, Jy/beam."""
+        return float(np.abs(self.pixels["residual"]).max())
+
+    @property
+    def model_flux(self) -> float:
+        """Flux of the model, Jy."""
+        return float(self.pixels["model"].sum(dtype=float))
+
+
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
                output: Output, record: Callable[[Result], dict] | None = None, limits: Limits = Limits()) -> Result:
     """Image a selection of MeasurementSets and write the products.
@@ -87,12 +118,11 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         checkpoint.open()
     # read
     data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
-    data.notes.extend(_limits(data, grid))
+    data.notes.extend(image_limits(data, grid))
     plane = define_image_plane(data, selection, grid, output.pblimit)
     grid = with_spectrum(grid, plane)
     if not plane.mask.any():
-        data.notes.append(f"phasecenter = '{grid.phasecenter}': the primary beam is nowhere in the image above pblimit = "
-                          f"{output.pblimit:g}, and its pixels are masked everywhere")
+        data.notes.append(nowhere_visible(grid, output))
     for note in data.notes:
         log.warn(note)
     start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
@@ -101,10 +131,9 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)),
                       forecast.summary())
     # split and weigh
-    block_of_sample, blocks = snapshot_blocks(data, output.blocks)
-    data, offsets = sort_into_blocks(data, block_of_sample)
-    noise = noise_from_differences(data, offsets)
-    _describe(data, blocks, noise)
+    part = split(data, output.blocks)
+    data, blocks, offsets, noise = part.data, part.blocks, part.offsets, part.noise
+    describe(data, blocks, noise)
     if grid.gridder == "wproject":
         log.info(WTerm.of(data.max_w, grid.shape, grid.cell_rad, operator_accuracy(data, offsets, noise)).words)
     _point_spread(data, grid, weighting, options, plane)  # what cannot be weighed or restored is refused before the hours
@@ -119,18 +148,29 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         data, blocks = without_wild(data, blocks, offsets, reconstruction)
     # write
     with waiting_child() as child:  # which starts meanwhile
-        weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
-        residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model), weights)
-        images = dict(psf=psf, residual=residual, model=model)
-        result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()),
-                        float(model.sum(dtype=float)), forecast.summary())
-        write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result),
-                       child)
+        images = plane_images(data, model, selection, grid, weighting, options, plane)
+        result = Result(data, blocks, noise, reconstruction, images.residual_peak, images.model_flux, forecast.summary())
+        write_products(output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
     if result.finished or not checkpoint.stands:  # else one of an older run
         checkpoint.remove()
     if output.savemodel == "modelcolumn":
         _save_model(selection, data, grid, options, model)
     return result
+
+
+def split(data, blocks):
+    """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`)."""
+    block_of_sample, infos = snapshot_blocks(data, blocks)
+    data, offsets = sort_into_blocks(data, block_of_sample)
+    noise = noise_from_differences(data, offsets)
+    return Split(data, infos, offsets, noise)
+
+
+def plane_images(data, model, selection, grid, weighting, options, plane):
+    """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of."""
+    weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
+    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model), weights)
+    return PlaneImages(dict(psf=psf, residual=residual, model=model), sum_of_weights(data, selection, weights), beam)
 
 
 def _save_model(selection, data, grid, options, model):
@@ -170,7 +210,7 @@ def _point_spread(data, grid, weighting, options, plane):
     return weights, operator, psf, fit_beam(psf, plane)
 
 
-def _limits(data, grid):
+def image_limits(data, grid):
     """What the user should know of this image plane and these baselines; raise where no image can be made of them."""
     notes = []
     check_cell(data.uvw[:2], grid.cell_rad)
@@ -194,7 +234,13 @@ def _after_iterations(data, grid, output, limits, read_s):
     return writing_seconds(data.size, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
 
-def _describe(data, blocks, noise):
+def nowhere_visible(grid, output):
+    """What the user should know of an image whose pixels are masked everywhere."""
+    return (f"phasecenter = '{grid.phasecenter}': the primary beam is nowhere in the image above pblimit = "
+            f"{output.pblimit:g}, and its pixels are masked everywhere")
+
+
+def describe(data, blocks, noise):
     """Say in the log what was read."""
     log.info(f"{data.size} Stokes I visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
              f"{len(blocks)} blocks")

@@ -58,7 +58,8 @@ class Spectrum:
 class ImageGrid:
     """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
 
-    `spectrum` is what `spectralindex` stands for, once it has been read.
+    `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis are '', a
+    channel number or a quantity; `nchan` is -1 where the data tell it.
     """
 
     shape: tuple[int, int]
@@ -70,6 +71,19 @@ class ImageGrid:
     gridder: str = "standard"
     spectralindex: str = ""
     spectrum: Spectrum | None = None
+    specmode: str = "mfs"
+    nchan: int = -1
+    start: int | str = ""
+    width: int | str = ""
+    outframe: str = "LSRK"
+    veltype: str = "radio"
+    restfreq: tuple[str, ...] = ()
+    interpolation: str = "nearest"
+
+    @property
+    def is_cube(self) -> bool:
+        """Whether the image has a plane for each channel."""
+        return self.specmode == "cube"
 
 
 @dataclass(frozen=True)

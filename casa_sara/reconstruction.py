@@ -15,7 +15,7 @@ from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_b
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, solve
 
-__all__ = ["Reconstruction", "operator_accuracy", "reconstruct", "schedule_of"]
+__all__ = ["Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
 
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
@@ -93,9 +93,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     CheckpointError
         The state that was read is not one of these data.
     """
-    if options.databound == "fixed" and len(options.l2bound) not in (1, len(offsets) - 1):
-        raise ValueError(f"l2bound = {list(options.l2bound)}: there are {len(offsets) - 1} blocks; give one noise level "
-                         "for all of them, or one for each")
+    check_l2bound(options, len(offsets) - 1)
     samples = Samples(data, np.asarray(offsets), density, np.arange(data.size))
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(np.mean(data.weight, dtype=float) ** -0.5)
@@ -176,6 +174,13 @@ def _resume(samples, problem_of, options, noise, checkpoint):
         solution.bounds.set_state(state["bounds"])
         solution.stage = Stage.of(state["stage"])
     return solution
+
+
+def check_l2bound(options, blocks):
+    """Raise ValueError where the noise levels given are not one for all blocks, or one for each."""
+    if options.databound == "fixed" and len(options.l2bound) not in (1, blocks):
+        raise ValueError(f"l2bound = {list(options.l2bound)}: there are {blocks} blocks; give one noise level "
+                         "for all of them, or one for each")
 
 
 def operator_accuracy(data, offsets, noise):

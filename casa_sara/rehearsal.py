@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import replace
+
+import numpy as np
 
 from casa_sara.casa import log
 from casa_sara.casa.census import take_census
 from casa_sara.casa.imageplane import define_image_plane
 from casa_sara.casa.ms import read_visibilities
+from casa_sara.casa.selection import select_data
+from casa_sara.casa.spectralaxis import channels_of, samples_of_channels, spectral_axis
 from casa_sara.casa.spectrum import spectral_band, with_spectrum
 from casa_sara.forecast import Workload, forecast
 from casa_sara.operators.measurement import check_field
@@ -29,17 +34,38 @@ def foresee(selection, grid, options, limits):
     casa_sara.forecast.Forecast
     """
     resident, available = resident_memory(), available_memory()
+    channels, share = _channels(selection, grid)
     for flags in (False, True):
         census = take_census(selection, flags)
         if any(census.reach):  # else there is nothing to read, which reading explains
             check_field(math.hypot(*census.reach), grid.shape, grid.cell_rad)
-        work = Workload.of(census, grid, options, limits.report, spectral_band(grid, census.freq_range_hz))
+        band = spectral_band(grid, census.freq_range_hz)
+        work = Workload.of(census, grid, options, limits.report, band, channels, share)
         found = forecast(work, resident, available, limits.maxmem_gb)
         if found.fits:
             break
     for line in found.lines():
         log.info(line)
     return found
+
+
+def _channels(selection, grid):
+    """Return how many channels a cube will have, and the share of the samples that is in the one with most; else 0, 1."""
+    if not grid.is_cube:
+        return 0, 1.0
+    axis = spectral_axis(selection, grid)
+    samples = samples_of_channels(selection, axis)
+    everything = sum(group.rows.size * group.channels.size for ms in select_data(selection)[0] for group in ms.groups)
+    if not samples.any():
+        raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no data are in these channels")
+    return axis.size, float(samples.max() / everything)
+
+
+def _fullest_channel(data, selection, grid):
+    """Return the samples of the channel of a cube that has most."""
+    channel = channels_of(data, selection, spectral_axis(selection, grid))
+    count = np.bincount(channel[channel >= 0], minlength=1)
+    return data.part(np.flatnonzero(channel == count.argmax()))
 
 
 def rehearse(selection, grid, options, blocks, limits):
@@ -72,19 +98,24 @@ def rehearse(selection, grid, options, blocks, limits):
     data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
     if grid.spectralindex:
         grid = with_spectrum(grid, define_image_plane(data, selection, grid))
+    everything = data.size
+    if grid.is_cube:
+        data = _fullest_channel(data, selection, grid)
     data, offsets = sort_into_blocks(data, snapshot_blocks(data, blocks)[0])
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
+    timing = replace(timing, channels=max(found.workload.channels, 1))
     for line in _time_lines(timing):
         log.info(line)
     seconds = {name: getattr(timing, name) for name in ("reading", "building", "pair", "nnls_iteration", "iteration",
                                                         "writing", "total")}
-    return found.summary() | {"visibilities": data.size, "iterations": timing.iterations, "seconds": seconds,
+    return found.summary() | {"visibilities": everything, "iterations": timing.iterations, "seconds": seconds,
                               "iteration_s": timing.iteration}
 
 
 def _time_lines(timing):
     """The times as lines of a table."""
-    yield f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations (the data decide)"
+    channels = f" for each of {timing.channels} channels" if timing.channels > 1 else ""
+    yield f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the data decide)"
     rows = {"reading": timing.reading, "building the operator": timing.building,
             "one iteration of NNLS": timing.nnls_iteration, "one iteration": timing.iteration, "writing the images": timing.writing}
     for name, seconds in rows.items():

@@ -54,8 +54,8 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
         Block j is the slice offsets[j]:offsets[j + 1].
     noise : float (d,)
         Measured in the data, in units of what the weights say; NaN where unknown.
-    selection : Selection
-        That gave the data, for their sampling density.
+    selection : Selection or None
+        That gave the data, for their sampling density; None where they are but a part of it.
     grid : ImageGrid
     options : SolverOptions
     start : float32 (nx, ny), optional

@@ -36,6 +36,8 @@ class Timing:
         Seconds of Φ with Φ†, of one iteration of NNLS and of one of the solver.
     iterations, reweightings : int
         Expected; the data decide.
+    channels : int
+        Of the image, each of which takes as much.
     """
 
     reading: float
@@ -46,15 +48,16 @@ class Timing:
     writing: float
     iterations: int
     reweightings: int
+    channels: int = 1
 
     @property
     def total(self) -> float:
         """Seconds of the run."""
         if not self.iterations:
-            return STARTING + self.reading + self.building + self.writing
+            return STARTING + self.reading + self.channels * (self.building + self.writing)
         solving = (self.iterations + REWEIGHTING * self.reweightings) * self.iteration
         first = NORM_PAIRS * self.pair + NNLS_ITERATIONS * self.nnls_iteration
-        return STARTING + self.reading + self.building + first + solving + self.writing
+        return STARTING + self.reading + self.channels * (self.building + first + solving + self.writing)
 
 
 def measure(data, offsets, grid, options, reading):

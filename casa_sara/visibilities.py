@@ -100,6 +100,14 @@ class Visibilities:
         per_sample += ("freq_hz",) if self.freq_hz is not None else ()
         return replace(self, **{name: np.take(getattr(self, name), index, axis=-1) for name in per_sample})
 
+    def part(self, index) -> Visibilities:
+        """Return the samples numbered `index`, in that order, with `rows` of their own."""
+        chosen = self.take(index)
+        used, row = np.unique(chosen.row, return_inverse=True)
+        chosen.row = row.astype(np.int32)
+        chosen.rows = RowTable(**{name: column[used] for name, column in vars(self.rows).items()})
+        return chosen
+
     @property
     def max_uv(self) -> float:
         """Longest projected baseline in wavelengths."""

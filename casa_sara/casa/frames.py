@@ -177,7 +177,7 @@ class Geometry:
             w at the image centre − w at the field's, in wavelengths: a visibility at the
             image centre is exp(−2πi·shift) times that at the field's. None when no row needs it.
         """
-        factors = self._lsrk_factors(group.frame, field, time)
+        factors = self.lsrk_factors(group.frame, field, time)
         self._note_range(group, factors)
         wave_number = group.freqs_hz / SPEED_OF_LIGHT * factors[:, None]
         rotated, turned = uvw_m, False
@@ -201,8 +201,8 @@ class Geometry:
         self.freq_range_hz[0] = min(self.freq_range_hz[0], float(low * factors.min()))
         self.freq_range_hz[1] = max(self.freq_range_hz[1], float(high * factors.max()))
 
-    def _lsrk_factors(self, frame, field, time):
-        """Return LSRK frequency / frequency in `frame` for every row."""
+    def lsrk_factors(self, frame, field, time):
+        """Return LSRK frequency / frequency in `frame` for every row, of which field and time (MJD seconds) are given."""
         factors = np.ones(time.size)
         if frame in ("LSRK", "REST", "Undefined"):
             return factors

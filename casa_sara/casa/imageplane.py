@@ -29,9 +29,9 @@ class ImagePlane:
     ----------
     csys : dict
         Record of the coordinate system: right ascension, declination, Stokes, frequency.
-    pb : float32 (nx, ny)
-        Primary beam, at most 1, and 0 below the limit.
-    mask : bool (nx, ny)
+    pb : float32 (nx, ny) or (nchan, nx, ny)
+        Primary beam, at most 1, and 0 below the limit; of each channel of a cube.
+    mask : bool, as `pb`
         Good pixels, where the primary beam is above the limit.
     imageinfo : dict
         Name of the source and type of the image.
@@ -51,10 +51,15 @@ class ImagePlane:
     @property
     def shape(self) -> tuple[int, int]:
         """Pixels in right ascension and declination."""
-        return self.pb.shape
+        return self.pb.shape[-2:]
+
+    @property
+    def channels(self) -> int:
+        """Planes along the spectral axis."""
+        return self.pb.size // (self.pb.shape[-2] * self.pb.shape[-1])
 
 
-def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT):
+def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels=1):
     """Return the image plane that tclean makes of this selection and grid.
 
     As in tclean, the MeasurementSet that begins first gives the date, the observer and the
@@ -68,10 +73,13 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT):
     grid : casa_sara.options.ImageGrid
     pblimit : float
         |pblimit| is the lowest primary beam; where it is negative, only .pb and what is divided by it are masked.
+    channels : int
+        Planes that it will have, as far as is known, for room on the disk of temporary files.
 
     Returns
     -------
     ImagePlane
+        Of a cube, its primary beam and mask have a plane for each channel.
 
     Raises
     ------
@@ -80,30 +88,40 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT):
     """
     if grid.reffreq:
         check_frequency(grid.reffreq, "reffreq")
-    with scratch_folder(grid.shape) as folder:
+    with scratch_folder((*grid.shape, channels)) as folder:
         root = os.path.join(folder, "plane")
         _make_primary_beam(visibilities, selection, grid, root)
         with opened("image", root + ".pb") as ia:
-            pb = read_pixels(ia)
+            pb = _read_planes(ia) if grid.is_cube else read_pixels(ia)
             csys, miscinfo = ia.coordsys().torecord(), ia.miscinfo()
         with opened("table", root + ".pb") as tb:
             imageinfo = tb.getkeyword("imageinfo")
-    pb /= max(pb.max(), np.float32(1))  # above 1 where several fields are imaged together
+    pb /= np.maximum(pb.max(axis=(-2, -1), keepdims=True), np.float32(1))  # above 1 where several fields are imaged together
     mask = pb > abs(pblimit)
     pb[~mask] = 0
     kept = {key: miscinfo[key] for key in ("INSTRUME", "distance") if key in miscinfo}
     return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept, masks_all=bool(pblimit >= 0))
 
 
-def read_pixels(ia, getmask=False):
-    """Return the pixels (nx, ny) of an open image's first plane: float32, or bool for its mask."""
+def read_pixels(ia, getmask=False, number=0):
+    """Return the pixels (nx, ny) of plane `number` of an open image: float32, or bool for its mask."""
     nx, ny, *rest = ia.shape()
     pixels = np.empty((nx, ny), bool if getmask else np.float32)
     for rows in slabs(nx, ny):
-        blc = [rows.start, 0] + [0] * len(rest)
-        trc = [rows.stop - 1, ny - 1] + [0] * len(rest)
+        place = [number if size > 1 else 0 for size in rest]  # one axis at most is longer
+        blc = [rows.start, 0] + place
+        trc = [rows.stop - 1, ny - 1] + place
         pixels[rows] = ia.getchunk(blc, trc, getmask=getmask).reshape(rows.stop - rows.start, ny)
     return pixels
+
+
+def _read_planes(ia):
+    """Return all planes (nchan, nx, ny) of an open cube."""
+    nx, ny, _, nchan = ia.shape()
+    planes = np.empty((nchan, nx, ny), np.float32)
+    for number in range(nchan):
+        planes[number] = read_pixels(ia, number=number)
+    return planes
 
 
 def slabs(nx, ny):
@@ -128,12 +146,18 @@ def _make_primary_beam(visibilities, selection, grid, root):
         try:
             imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
         except RuntimeError as error:
-            parameters = (f"imsize = {list(grid.shape)}, projection = '{grid.projection}', reffreq = '{grid.reffreq}', "
+            parameters = (f"imsize = {list(grid.shape)}, projection = '{grid.projection}', {_spectral_words(grid)}, "
                           f"vis = {list(selection.vis)}")
             raise ValueError(f"{parameters}: CASA makes no image of them: {' '.join(str(error).split())}") from error
         imager.makepb()
     finally:
         imager.done()
+
+
+def _spectral_words(grid):
+    """Return the task parameters of the spectral axis, for a message."""
+    names = ("nchan", "start", "width", "outframe", "veltype", "restfreq") if grid.is_cube else ("reffreq",)
+    return ", ".join(f"{name} = {getattr(grid, name)!r}" for name in names)
 
 
 def _by_start(visibilities):
@@ -170,9 +194,14 @@ def _image_record(visibilities, grid, root):
         "phasecenter": f"{center['refer']} {longitude!r}rad {latitude!r}rad",
         "stokes": grid.stokes,
         "projection": grid.projection,
-        "specmode": "mfs",
+        "specmode": grid.specmode,
         "reffreq": grid.reffreq,
-        "nchan": 1,
-        "outframe": "LSRK",
+        "nchan": grid.nchan if grid.is_cube else 1,
+        "start": grid.start,
+        "width": grid.width,
+        "outframe": grid.outframe,
+        "veltype": grid.veltype,
+        "restfreq": list(grid.restfreq),
+        "interpolation": grid.interpolation,
         "deconvolver": "hogbom",
     }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 
 import numpy as np
@@ -14,43 +15,52 @@ __all__ = ["read_model", "write_image"]
 
 
 def write_image(name, pixels, plane, unit="", beam=None, masked=False):
-    """Write one image plane with the axes right ascension, declination, Stokes and frequency.
+    """Write an image, of one plane or one for each channel, with the axes right ascension, declination, Stokes and frequency.
 
     Parameters
     ----------
     name : str
-    pixels : real (nx, ny)
+    pixels : real (nx, ny) or (nchan, nx, ny)
     plane : ImagePlane
     unit : str
         'Jy/pixel', 'Jy/beam', or '' as tclean leaves it on .psf, .residual, .pb and .sumwt.
-    beam : dict, optional
-        Restoring beam {'major', 'minor', 'positionangle'}.
+    beam : dict or list of nchan dict, optional
+        Restoring beam {'major', 'minor', 'positionangle'}, or that of each channel.
     masked : bool
         Give it the pixel mask 'mask0' of the image plane.
     """
     import casatools
 
-    nx, ny = pixels.shape
+    nx, ny = pixels.shape[-2:]
+    planes = pixels.reshape(-1, nx, ny)
     ia = casatools.image()
-    ia.fromshape(name, [nx, ny, 1, 1], csys=plane.csys, log=False)
+    ia.fromshape(name, [nx, ny, 1, len(planes)], csys=plane.csys, log=False)
     try:
-        for rows in slabs(nx, ny):
-            ia.putchunk(pixels[rows, :, None, None], blc=[rows.start, 0, 0, 0])
+        for channel, rows in itertools.product(range(len(planes)), slabs(nx, ny)):
+            ia.putchunk(planes[channel, rows, :, None, None], blc=[rows.start, 0, 0, channel])
         if masked:
             ia.calcmask("T", name="mask0")
-            ia.putregion(pixelmask=plane.mask[:, :, None, None], usemask=False)
+            ia.putregion(pixelmask=np.moveaxis(plane.mask.reshape(planes.shape), 0, -1)[:, :, None], usemask=False)
         if unit:
             ia.setbrightnessunit(unit)
         ia.setmiscinfo(plane.miscinfo)
     finally:
         ia.close()
     with opened("table", name, nomodify=False) as tb:
-        tb.putkeyword("imageinfo", plane.imageinfo | ({"restoringbeam": beam} if beam else {}))
+        tb.putkeyword("imageinfo", plane.imageinfo | _beam_record(beam))
     with opened("table", os.path.join(name, "logtable"), nomodify=False) as tb:
         tb.removerows(list(range(tb.nrows())))  # how the image was made of temporary files
 
 
-def read_model(name, plane):
+def _beam_record(beam):
+    """Return what an image's information says of its beam, or beams."""
+    if not isinstance(beam, (list, tuple)):
+        return {"restoringbeam": beam} if beam else {}
+    beams = {f"*{channel}": one for channel, one in enumerate(beam)}
+    return {"perplanebeams": {"nChannels": len(beam), "nStokes": 1} | beams}
+
+
+def read_model(name, plane, channel=0):
     """Return a model image on the pixels of `plane`, its flux kept.
 
     On another grid each pixel's flux is shared among the new pixels around its place; a pixel
@@ -62,6 +72,8 @@ def read_model(name, plane):
     name : str
         A CASA image in Jy/pixel.
     plane : ImagePlane
+    channel : int
+        Of the image; a model of one channel serves all of them.
 
     Returns
     -------
@@ -77,9 +89,12 @@ def read_model(name, plane):
     try:
         with opened("image", name) as ia:
             shape, unit, csys = tuple(ia.shape()), ia.brightnessunit(), ia.coordsys()
-            if len(shape) < 2 or int(np.prod(shape[2:])) != 1:
-                raise ValueError(f"startmodel = '{name}' has the shape {shape}: it takes one Stokes, one channel")
-            pixels = np.where(read_pixels(ia, getmask=True), read_pixels(ia), np.float32(0))
+            planes = int(np.prod(shape[2:]))
+            if len(shape) < 2 or planes not in (1, plane.channels) or planes != max(shape[2:], default=1):
+                right = f"one channel, or {plane.channels}" if plane.channels > 1 else "one channel"
+                raise ValueError(f"startmodel = '{name}' has the shape {shape}: it takes one Stokes, {right}")
+            number = channel if planes > 1 else 0
+            pixels = np.where(read_pixels(ia, True, number), read_pixels(ia, False, number), np.float32(0))
     except RuntimeError as error:
         raise ValueError(f"startmodel = '{name}' cannot be read as an image: {error}") from error
     if unit != "Jy/pixel":

@@ -145,12 +145,12 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     output : casa_sara.options.Output
         Its `imagename`, `restoringbeam` and `history`, lines for the history of every image.
     plane : ImagePlane
-    images : dict of float32 (nx, ny)
+    images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
         residual in Jy/beam) and 'model' in Jy/pixel.
-    sumwt : float
+    sumwt : float, or one for each channel
     beam : dict
-        Of `restore.fit_beam`.
+        Of `restore.fit_beam`, or a list with one for each channel.
     record : dict, optional
         Kept as `RECORD`.
     child : Popen, optional
@@ -162,16 +162,16 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
         The images could not be written, as on a full disk; everything is as it was before.
     """
     more = 2 * output.pbcor
-    check_imagename(output.imagename, plane.shape, more)  # the disk may have filled up since the run began
+    check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
-            in_child("products", child, root=root, plane=vars(plane), images=images, sumwt=float(sumwt), beam=beam,
-                     restoringbeam=output.restoringbeam, history=output.history, pbcor=output.pbcor)
+            in_child("products", child, root=root, plane=vars(plane), images=images, sumwt=np.asarray(sumwt, np.float32),
+                     beam=beam, restoringbeam=output.restoringbeam, history=output.history, pbcor=output.pbcor)
             if record is not None:
                 jsonfile.save(root + RECORD, record)
             _sync(os.path.dirname(root))
         except (ChildError, OSError) as error:
-            raise _not_written(output.imagename, _bytes_needed(plane.shape, more), os.path.dirname(root), error) from error
+            raise _not_written(output.imagename, _bytes_needed(plane.pb.shape, more), os.path.dirname(root), error) from error
 
 
 def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor=False):
@@ -181,9 +181,9 @@ def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor
     write_image(root + ".residual", images["residual"], plane, masked=plane.masks_all)
     write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
     write_image(root + ".pb", plane.pb, plane, masked=True)
-    write_image(root + ".sumwt", np.array([[sumwt]], np.float32), plane)
+    write_image(root + ".sumwt", sumwt.reshape(-1, 1, 1), plane)
     if restoringbeam is not None:
-        restore(root, restoringbeam)
+        restore(root, restoringbeam, "cube" if plane.pb.ndim == 3 else "mfs")
     if pbcor:
         write_corrected(root, plane, images["model"])
     for path in existing_products(root):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["check_frequency", "hertz", "radians", "seconds"]
+__all__ = ["check_frequency", "check_spectral", "hertz", "radians", "seconds"]
 
 
 def radians(text, parameter):
@@ -56,6 +56,15 @@ def hertz(text, parameter):
     if not 0 < value < math.inf:
         raise ValueError(f"{parameter} = '{text}' should be a positive frequency, as '1.4GHz'")
     return value
+
+
+def check_spectral(text, parameter):
+    """Return 'Hz' or 'km/s', whichever fits a frequency or velocity as '1.42GHz' or '-10km/s'; raise ValueError for others."""
+    for unit in ("Hz", "km/s"):
+        if _is(text, unit):
+            return unit
+    raise ValueError(f"{parameter} = '{text}' is neither a channel number, a frequency nor a velocity: it takes 5, "
+                     "'1.42GHz' or '10km/s'")
 
 
 def _is(text, unit):

@@ -55,13 +55,13 @@ def fit_beam(psf, plane):
 
 
 def restoring_beam_words(restoringbeam):
-    """Return tclean's `restoringbeam` as a list of strings, empty for the fitted beam.
+    """Return tclean's `restoringbeam` as a list of strings, empty for the beam of each channel.
 
     Parameters
     ----------
     restoringbeam : str or sequence
-        '' or [] or 'common' (the same in an image of one channel), one angle for a circular
-        beam, or [major, minor, position angle].
+        '' or [] for the fitted one, 'common' for the smallest that holds those of all channels (the same in an image
+        of one channel), one angle for a circular beam, or [major, minor, position angle].
 
     Raises
     ------
@@ -71,7 +71,7 @@ def restoring_beam_words(restoringbeam):
     words = [restoringbeam] if isinstance(restoringbeam, str) else [str(word) for word in restoringbeam]
     words = [word.strip() for word in words if word.strip()]
     if words in ([], ["common"]):
-        return []
+        return words
     if len(words) not in (1, 3):
         raise ValueError(f"restoringbeam = {words} takes one angle, or [major, minor, position angle]")
     axes = [radians(word, "restoringbeam") for word in words[:2]]
@@ -82,7 +82,7 @@ def restoring_beam_words(restoringbeam):
     return words
 
 
-def restore(root, restoringbeam=()):
+def restore(root, restoringbeam=(), specmode="mfs"):
     """Write `root`.image = `root`.model ∗ beam + `root`.residual, in Jy/beam.
 
     The residual is smoothed to the beam too, as in tclean, when the beam is not the fitted
@@ -93,19 +93,22 @@ def restore(root, restoringbeam=()):
     root : str
     restoringbeam : str or sequence
         See `restoring_beam_words`.
+    specmode : str
+        'mfs' or 'cube'.
     """
     import casatools
 
+    words = restoring_beam_words(restoringbeam)
     deconvolver = casatools.synthesisdeconvolver()
     try:
         deconvolver.setupdeconvolution(
             {
                 "imagename": root,
                 "deconvolver": "hogbom",
-                "specmode": "mfs",
+                "specmode": specmode,
                 "usemask": "user",
                 "startmodel": "",
-                "restoringbeam": restoring_beam_words(restoringbeam),
+                "restoringbeam": words if specmode == "cube" or words != ["common"] else [],
             }
         )
         deconvolver.restore()
@@ -122,10 +125,13 @@ def write_corrected(root, plane, model):
     ----------
     root : str
     plane : ImagePlane
-    model : float32 (nx, ny), Jy/pixel
+    model : float32 (nx, ny) or (nchan, nx, ny), Jy/pixel
     """
     with opened("image", root + ".image") as ia:
-        image, beam = read_pixels(ia), ia.restoringbeam()
+        image = np.array([read_pixels(ia, number=k) for k in range(plane.channels)]).reshape(plane.pb.shape)
+        beam = ia.restoringbeam()
+    if "beams" in beam:
+        beam = [beam["beams"][f"*{k}"]["*0"] for k in range(plane.channels)]
     for name, pixels, unit, beam in ((".image", image, "Jy/beam", beam), (".model", model, "Jy/pixel", None)):
         corrected = np.divide(pixels, plane.pb, out=np.zeros_like(pixels), where=plane.mask)
         write_image(f"{root}{name}.pbcor", corrected, plane, unit=unit, beam=beam, masked=True)

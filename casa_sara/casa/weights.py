@@ -42,7 +42,9 @@ def sampling_density(visibilities, selection, grid):
     Parameters
     ----------
     visibilities : casa_sara.visibilities.Visibilities
-    selection : casa_sara.options.Selection
+    selection : casa_sara.options.Selection or None
+        That is read again; None where the samples are not all of a selection, but those of one channel of a cube, and
+        so are counted here.
     grid : casa_sara.options.ImageGrid
 
     Returns
@@ -56,7 +58,7 @@ def sampling_density(visibilities, selection, grid):
     u, v = _field_uv(visibilities, "data")
     cells = _cells(u, v, (side, side), (cell, cell))
     density = np.zeros(visibilities.size, np.float32)
-    if visibilities.dropped.keys() <= set(IN_FLAGS):
+    if selection is not None and visibilities.dropped.keys() <= set(IN_FLAGS):
         for number in np.unique(visibilities.rows.ms):
             try:
                 density += _imager_grid(visibilities.ms_names[number], selection.of(number), side, cell)[cells]

@@ -9,7 +9,7 @@ import numpy as np
 import casa_sara
 from casa_sara.solver.record import ITERATION_LIMIT, STOP_DESCRIPTIONS
 
-__all__ = ["summary"]
+__all__ = ["cube_summary", "summary"]
 
 WHY = {
     "threshold_jy_per_pixel": "kappa of the last iteration: starts at 0.15 of the mean brightness of the NNLS image, "
@@ -39,7 +39,7 @@ def summary(result, options, full: bool = False) -> dict[str, Any]:
     """
     solved = result.reconstruction
     record = solved.record if solved else None
-    ends = [update["iteration"] for update in record.reweightings] + [record.iteration[-1]] if record else []
+    ends = _ends(result)
     code = record.stop_code if record else ITERATION_LIMIT
     minor = {"iterDone": ends, "peakRes": [result.residual_peak], "modelFlux": [result.model_flux]}
     return {
@@ -54,8 +54,80 @@ def summary(result, options, full: bool = False) -> dict[str, Any]:
     }
 
 
+def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
+    """Return the outcome of a run that made a cube.
+
+    Parameters
+    ----------
+    result : casa_sara.cube.CubeResult
+    options : casa_sara.options.SolverOptions
+    full : bool
+        Add the history of every iteration.
+
+    Returns
+    -------
+    dict
+        As of :func:`summary`, the iterations counted through all channels; `summaryminor` has every channel that is not
+        blank, with its stop code, and `sara` a record of each.
+    """
+    minor, ends, done = {}, [], 0
+    for number, channel in enumerate(result.channels):
+        if channel.result:
+            minor[number] = {0: _minor(channel.result)}
+            ends += [done + end for end in minor[number][0]["iterDone"]]
+            done = ends[-1] if ends else 0
+    return {
+        "iterdone": done,
+        "niter": options.niter,
+        "nmajordone": max(len(ends), 1),
+        "stopcode": result.stop_code,
+        "stopDescription": STOP_DESCRIPTIONS[result.stop_code],
+        "summarymajor": np.array(ends, int),
+        "summaryminor": {0: minor},
+        "sara": {
+            "version": casa_sara.__version__,
+            "visibilities": result.data.size,
+            "dropped": dict(result.data.dropped),
+            "notes": list(result.data.notes),
+            "nthreads": options.nthreads,
+            "forecast": dict(result.forecast),
+            "outframe": result.frame,
+            "channels": [_channel(channel, options, full) for channel in result.channels],
+        },
+    }
+
+
+def _channel(channel, options, full):
+    """Return the record of one channel."""
+    entry = {"frequency_hz": channel.freq_hz, "sumwt": channel.sumwt, "blank": channel.result is None}
+    if channel.result is None:
+        return entry
+    result = channel.result
+    code = result.reconstruction.record.stop_code if result.reconstruction else ITERATION_LIMIT
+    beam = {axis: f"{channel.beam[axis]['value']:.9g}{channel.beam[axis]['unit']}" for axis in ("major", "minor", "positionangle")}
+    entry |= {"visibilities": result.data.size, "dropped": dict(result.data.dropped), "beam": beam, "stopcode": code,
+              "stopDescription": STOP_DESCRIPTIONS[code],
+              "blocks": [_block(result, j) for j in range(len(result.blocks))]}
+    return entry | _solution(result, options, full)
+
+
+def _ends(result):
+    """Return the iterations after which the ℓ1 problems of a solution ended."""
+    if not result.reconstruction:
+        return []
+    record = result.reconstruction.record
+    return [update["iteration"] for update in record.reweightings] + [record.iteration[-1]]
+
+
+def _minor(result):
+    """Return tclean's entry of one plane in `summaryminor`."""
+    solved = result.reconstruction
+    return {"iterDone": _ends(result), "peakRes": [result.residual_peak], "modelFlux": [result.model_flux],
+            "stopCode": solved.record.stop_code if solved else ITERATION_LIMIT}
+
+
 def _sara(result, options, full):
-    data, solved = result.data, result.reconstruction
+    data = result.data
     sara = {
         "version": casa_sara.__version__,
         "visibilities": data.size,
@@ -65,6 +137,12 @@ def _sara(result, options, full):
         "nthreads": options.nthreads,
         "forecast": dict(result.forecast),
     }
+    return sara | _solution(result, options, full)
+
+
+def _solution(result, options, full):
+    """Return what is known of a solution, nothing where there is none."""
+    solved, sara = result.reconstruction, {}
     if solved:
         record = solved.record
         sara["chosen"] = {

@@ -17,10 +17,12 @@ from casa_sara.casa.products import (
 )
 from casa_sara.casa.quantities import hertz, radians, seconds
 from casa_sara.casa.restore import restoring_beam_words
+from casa_sara.casa.spectralaxis import channel_number
 from casa_sara.casa.spectrum import check_spectral_index
+from casa_sara.cube import make_cube
 from casa_sara.imaging import make_image
 from casa_sara.options import Comparing, ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
-from casa_sara.private.summary import summary
+from casa_sara.private.summary import cube_summary, summary
 from casa_sara.rehearsal import rehearse
 from casa_sara.resources import available_cores
 
@@ -37,6 +39,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
                           tuple(parameters["uvtaper"]))
     options = _solver_options(parameters)
+    _refuse_for_cubes(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"]:
         return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
@@ -47,13 +50,14 @@ def tsara(**parameters: Any) -> dict[str, Any]:
         if output.savemodel == "modelcolumn":
             check_model_column_writable(selection)
         _warn_of_incomplete(selection.vis, output)
-        result = make_image(selection, grid, weighting, options, output,
-                            lambda result: summary(result, options, full=True)["sara"], limits)
+        make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
+        result = make(selection, grid, weighting, options, output,
+                      lambda result: tell(result, options, full=True)["sara"], limits)
         if parameters["report"]:
             _report(output.imagename, selection, options.nthreads)
         elif not output.images_stand:
             folder.remove(Path(output.imagename + REPORT))  # of older images
-    return summary(result, options, parameters["fullsummary"])
+    return tell(result, options, parameters["fullsummary"])
 
 
 def _warn_of_incomplete(vis, output):
@@ -94,7 +98,8 @@ def _grid(parameters):
     shape = _pair(parameters["imsize"], "imsize", "one number of pixels, or two")
     cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
-                     parameters["stokes"], parameters["reffreq"], parameters["gridder"], _spectral_index(parameters))
+                     parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
+                     spectralindex=_spectral_index(parameters), **_spectral(parameters))
 
 
 def _spectral_index(parameters):
@@ -104,6 +109,28 @@ def _spectral_index(parameters):
     if text and parameters["reffreq"]:
         hertz(parameters["reffreq"], "reffreq")
     return text
+
+
+def _spectral(parameters):
+    """Return the parameters of the spectral axis, of which only the mode counts for a continuum image."""
+    if parameters["specmode"] != "cube":
+        return {"specmode": parameters["specmode"]}
+    restfreq = parameters["restfreq"]
+    restfreq = [restfreq] if isinstance(restfreq, str) else restfreq
+    return {name: parameters[name] for name in ("specmode", "nchan", "outframe", "veltype", "interpolation")} | {
+        "start": channel_number(parameters["start"], "start"), "width": channel_number(parameters["width"], "width"),
+        "restfreq": tuple(text for text in restfreq if text)}
+
+
+def _refuse_for_cubes(parameters):
+    """Raise for what is made of one plane only."""
+    if parameters["specmode"] != "cube":
+        return
+    if parameters["savemodel"] != "none":
+        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written from "
+                         "continuum images only; should be 'none'")
+    if parameters["report"]:
+        raise ValueError("report = True with specmode = 'cube': the report is of one image; should be False")
 
 
 def _pair(value, name, right):

@@ -61,7 +61,7 @@ class Checkpoint:
                 self._compare(name, found[name], self._header[name])
             self._found, self.state, self.stands = found, state, True
         except CheckpointError as error:
-            raise self._refusal(error) from None
+            raise self.refusal(error) from None
 
     def identify(self, **data):
         """Say what the data are, by arrays or None, and hold that against what was read.
@@ -78,7 +78,7 @@ class Checkpoint:
             found = self._found["data"]
             different = [name for name, value in self._header["data"].items() if found.get(name) != value]
             if different:
-                raise self._refusal(f"it is of other data: {', '.join(different)} differ")
+                raise self.refusal(f"it is of other data: {', '.join(different)} differ")
 
     @contextmanager
     def applied(self):
@@ -86,7 +86,7 @@ class Checkpoint:
         try:
             yield self.state
         except (LookupError, TypeError, ValueError, AttributeError) as error:
-            raise self._refusal(f"its state does not fit ({error})") from None
+            raise self.refusal(f"its state does not fit ({error})") from None
         age = time.time() - self._found["written"]
         self.tell(f"resuming from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
         self.state = None
@@ -124,6 +124,7 @@ class Checkpoint:
             raise CheckpointError(f"it is of a run with other {name}: {pairs}")
         raise CheckpointError(f"it is of another {name} of casa_sara: {found}, and this is {wanted}")
 
-    def _refusal(self, reason):
+    def refusal(self, reason):
+        """Return the error that says why the file cannot be resumed from."""
         return CheckpointError(f"restart = True: '{self.path}' cannot be resumed: {reason}. Run as it was begun, or "
                                "set restart = False and overwrite = True to begin anew, or choose another imagename")

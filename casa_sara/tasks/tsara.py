@@ -22,9 +22,17 @@ PARAMETERS = (
     Parameter('stokes', ('string',), 'I', 'Stokes plane to make', allowed=('I',)),
     Parameter('projection', ('string',), 'SIN', 'Coordinate projection', allowed=('SIN',)),
     Parameter('startmodel', ('string',), '', 'Name of starting model image'),
-    Parameter('specmode', ('string',), 'mfs', 'Spectral definition mode', allowed=('mfs',)),
+    Parameter('specmode', ('string',), 'mfs', 'Spectral definition mode (mfs, cube)', allowed=('mfs', 'cube')),
     Parameter('reffreq', ('string',), '', 'Reference frequency', opener='specmode', open_on=('mfs',)),
     Parameter('spectralindex', ('string', 'double'), '', "Known spectral index of the sky: a number, or an image of it; '': flat", opener='specmode', open_on=('mfs',)),
+    Parameter('nchan', ('int',), -1, 'Number of channels in the output image', opener='specmode', open_on=('cube',)),
+    Parameter('start', ('int', 'string'), '', "First channel (e.g. start=3, start='1.1GHz', start='15343km/s')", opener='specmode', open_on=('cube',)),
+    Parameter('width', ('int', 'string'), '', "Channel width (e.g. width=2, width='0.1MHz', width='10km/s')", opener='specmode', open_on=('cube',)),
+    Parameter('outframe', ('string',), 'LSRK', "Spectral reference frame in which to interpret 'start' and 'width'", allowed=('LSRK', 'LSRD', 'BARY', 'GEO', 'TOPO', 'GALACTO', 'LGROUP', 'CMB'), opener='specmode', open_on=('cube',)),
+    Parameter('veltype', ('string',), 'radio', 'Velocity type (radio, optical, z, beta)', allowed=('radio', 'optical', 'z', 'beta'), opener='specmode', open_on=('cube',)),
+    Parameter('restfreq', ('string', 'stringVec'), [], 'List of rest frequencies', opener='specmode', open_on=('cube',)),
+    Parameter('interpolation', ('string',), 'nearest', 'Spectral interpolation (nearest)', allowed=('nearest',), opener='specmode', open_on=('cube',)),
+    Parameter('perchanweightdensity', ('bool',), True, 'Whether to calculate the weight density per channel', allowed=(True,), opener='specmode', open_on=('cube',)),
     Parameter('gridder', ('string',), 'standard', 'Gridding options (standard, wproject)', allowed=('standard', 'wproject')),
     Parameter('wprojplanes', ('int',), -1, 'For scripts of tclean; the w-term needs no planes here', minimum=-1.0, opener='gridder', open_on=('wproject',)),
     Parameter('pblimit', ('double',), 0.2, 'PB gain level at which to cut off normalizations', minimum=-1.0, maximum=1.0),
@@ -211,12 +219,15 @@ class _tsara:
         what it converges to.
         Example: startmodel='first.model'
 
-    specmode : {'mfs'}, default 'mfs'
-        Only 'mfs': one continuum image of all selected channels. The sky is assumed to be as bright
-        at all frequencies, unless spectralindex says how it changes: a source of another spectrum is
-        averaged over the band, and across a wide band leaves errors around it that no model can
-        fit (a spectral index of -0.8 from 1 to 2 GHz: 40 % between the ends). Primary beams are not
-        modelled, nor how they change with frequency.
+    specmode : {'mfs', 'cube'}, default 'mfs'
+        'mfs'   one continuum image of all selected channels. The sky is assumed to be as bright at
+                all frequencies, unless spectralindex says how it changes: a source of another
+                spectrum is averaged over the band, and across a wide band leaves errors around it
+                that no model can fit (a spectral index of -0.8 from 1 to 2 GHz: 40 % between the
+                ends). Primary beams are not modelled, nor how they change with frequency.
+        'cube'  an image of each channel, on the spectral axis that tclean makes of the same
+                parameters. The channels are solved one after the other, each from its own data,
+                with its own blocks, bounds and beam; niter and the blocks are those of a channel.
 
     reffreq : str, default ''
         Opened by specmode = 'mfs'.
@@ -236,6 +247,53 @@ class _tsara:
         parameter.)
         Examples: spectralindex=-0.7
                   spectralindex='clean.alpha'
+
+    nchan : int, default -1
+        Opened by specmode = 'cube'.
+        -1 takes as many as the selected data, start and width make. Channels without data are blank:
+        zero, and masked in .residual and .image.
+        Example: nchan=100
+
+    start : int or str, default ''
+        Opened by specmode = 'cube'.
+        The first channel of the image: the number of a channel of the data, or its frequency or
+        velocity in outframe. '' takes the first channel selected.
+        Examples: start=5
+                  start='1.4201GHz'
+                  start='-15km/s'
+
+    width : int or str, default ''
+        Opened by specmode = 'cube'.
+        How many channels of the data make one of the image, or its width in frequency or velocity, in
+        the same kind as start. A negative width turns the order: falling channel numbers, frequencies
+        or velocities. '' takes the width of a channel of the data.
+        Examples: width=2
+                  width='-40kHz'
+                  width='2km/s'
+
+    outframe : {'LSRK', 'LSRD', 'BARY', 'GEO', 'TOPO', 'GALACTO', 'LGROUP', 'CMB'}, default 'LSRK'
+        Opened by specmode = 'cube'.
+        The frame of the spectral axis; the data are followed to it in time.
+
+    veltype : {'radio', 'optical', 'z', 'beta'}, default 'radio'
+        Opened by specmode = 'cube'.
+        What a velocity in start and width means.
+
+    restfreq : str or list of str, default []
+        Opened by specmode = 'cube'.
+        The rest frequency of velocities, the first of a list. [] takes that in the MeasurementSet, or
+        else the middle of the selected channels.
+        Example: restfreq='1.420405752GHz'
+
+    interpolation : {'nearest'}, default 'nearest'
+        Opened by specmode = 'cube'.
+        Only 'nearest': every channel of the data goes whole to the channel of the image that holds its
+        frequency. Interpolation between channels would correlate their noise, and no sample would be
+        what was measured, on which the bounds depend.
+
+    perchanweightdensity : {True}, default True
+        Opened by specmode = 'cube'.
+        Only True: uniform and Briggs weights of a channel are those of its own samples.
 
     gridder : {'standard', 'wproject'}, default 'standard'
         What is modelled of the way from the sky to the visibilities:
@@ -492,9 +550,10 @@ class _tsara:
     def __call__(
         self, vis='', selectdata=True, field='', spw='', timerange='', uvrange='', antenna='', scan='', observation='',
         intent='', datacolumn='corrected', imagename='', imsize=[100], cell=[], phasecenter='', stokes='I',
-        projection='SIN', startmodel='', specmode='mfs', reffreq='', spectralindex='', gridder='standard',
-        wprojplanes=-1, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True,
-        restoringbeam=[], pbcor=False, niter=100000,
+        projection='SIN', startmodel='', specmode='mfs', reffreq='', spectralindex='', nchan=-1, start='', width='',
+        outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest', perchanweightdensity=True,
+        gridder='standard', wprojplanes=-1, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[],
+        restoration=True, restoringbeam=[], pbcor=False, niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
         precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
         l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003,

@@ -1,0 +1,230 @@
+"""The story of a spectral cube: read, give every sample its channel, and image one channel after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from casa_sara.casa import log
+from casa_sara.casa.child import waiting_child
+from casa_sara.casa.imageplane import ImagePlane, define_image_plane
+from casa_sara.casa.images import read_model
+from casa_sara.casa.ms import read_visibilities
+from casa_sara.casa.products import check_imagename, write_products
+from casa_sara.casa.spectralaxis import SpectralAxis, channels_of
+from casa_sara.cubestate import CubeCheckpoint
+from casa_sara.deadline import Deadline
+from casa_sara.imaging import Result, describe, image_limits, nowhere_visible, plane_images, split
+from casa_sara.interrupt import stop_on_interrupt
+from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.reconstruction import check_l2bound, schedule_of
+from casa_sara.rehearsal import foresee
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, UNFINISHED
+from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
+from casa_sara.timing import Pace, writing_seconds
+from casa_sara.visibilities import Visibilities
+
+__all__ = ["Channel", "CubeResult", "make_cube"]
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How many samples a channel has, and what was left out: what remains of its visibilities."""
+
+    size: int
+    dropped: dict[str, int]
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class Channel:
+    """One channel: its frequency in the frame of the axis, and what was found; a blank one has neither result nor beam."""
+
+    freq_hz: float
+    result: Result | None = None
+    sumwt: float = 0.0
+    beam: dict | None = None
+
+
+@dataclass
+class CubeResult:
+    """What one run found, for the return value of the task; `stopped` is the code of what ended it early, else 0."""
+
+    data: Tally
+    channels: list[Channel]
+    frame: str
+    forecast: dict
+    stopped: int = 0
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left for a restart to go on with."""
+        return self.stopped not in UNFINISHED
+
+    @property
+    def stop_code(self) -> int:
+        """Of the run: that of the first channel that did not converge, if there is one."""
+        if self.stopped:
+            return self.stopped
+        solved = [channel.result.reconstruction for channel in self.channels if channel.result]
+        codes = [one.record.stop_code if one else ITERATION_LIMIT for one in solved]
+        return next((code for code in codes if code not in (CONVERGED, NOISE_ONLY)), CONVERGED)
+
+
+@dataclass
+class _Request:
+    """What the task was asked for."""
+
+    selection: Selection
+    grid: ImageGrid
+    weighting: Weighting
+    options: SolverOptions
+    output: Output
+
+
+def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
+              output: Output, record: Callable[[CubeResult], dict] | None = None, limits: Limits = Limits()) -> CubeResult:
+    """Image a selection of MeasurementSets channel by channel and write the products; see :func:`casa_sara.imaging.make_image`."""
+    deadline, forecast = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
+    forecast.require(limits.maxmem_gb)
+    checkpoint = CubeCheckpoint(checkpoint_of(selection, grid, options, output))
+    if output.resume:
+        checkpoint.file.open()
+    # read
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    data.notes.extend(image_limits(data, grid))
+    cube = _Cube.of(_Request(selection, grid, weighting, options, output), data, forecast.workload.channels)
+    check_imagename(output.imagename, cube.plane.pb.shape, 2 * output.pbcor)
+    for note in data.notes:
+        log.warn(note)
+    # the dirty cube: what cannot be weighed or restored is refused before the hours
+    for k in cube.filled:
+        cube.make_dirty(k)
+    # solve
+    stopped = 0
+    if options.niter > 0:
+        checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, channels=cube.order)
+        deadline.reserve = cube.plane.channels * writing_seconds(0, grid.shape) + writing_seconds(data.size, (0,))
+        stopped = _solve_channels(cube, checkpoint, deadline)
+    # write
+    result = CubeResult(Tally(data.size, data.dropped, tuple(data.notes)), cube.channels, cube.axis.frame, forecast.summary(), stopped)
+    with waiting_child() as child:
+        write_products(output, cube.plane, cube.images, [channel.sumwt for channel in cube.channels], cube.beams(),
+                       record and record(result), child)
+    if result.finished or not checkpoint.file.stands:  # else one of an older run
+        checkpoint.file.remove()
+    return result
+
+
+def _solve_channels(cube, checkpoint, deadline):
+    """Solve one channel after the other; return the code of what ended that early, 0 where nothing did."""
+    with stop_on_interrupt() as pressed:
+        for k in cube.filled:
+            if pressed():
+                checkpoint.keep(-1, lambda: None, 0, now=True)
+                return STOPPED_BY_USER
+            reconstruction = checkpoint.finished.get(k)
+            if reconstruction is None:
+                of_channel = checkpoint.of(k)
+                reconstruction = cube.solve(k, of_channel, deadline)
+                code = reconstruction.record.stop_code
+                if code in UNFINISHED:
+                    cube.take(k, reconstruction)
+                    if not of_channel.kept:
+                        checkpoint.keep(-1, lambda: None, 0, now=True)
+                    return code
+                checkpoint.finish(k, reconstruction)
+            cube.take(k, reconstruction)
+    return 0
+
+
+@dataclass
+class _Cube:
+    """The images of all channels so far: `images` are 'psf', 'residual' and 'model', float32 (nchan, nx, ny)."""
+
+    request: _Request
+    data: Visibilities
+    plane: ImagePlane
+    axis: SpectralAxis
+    order: np.ndarray
+    first: np.ndarray
+    channels: list[Channel]
+    images: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, request, data, planes):
+        """Lay out the axis and sort the samples by channel; there are no images yet."""
+        plane = define_image_plane(data, request.selection, request.grid, request.output.pblimit, planes)
+        if not plane.mask.any():
+            data.notes.append(nowhere_visible(request.grid, request.output))
+        axis = SpectralAxis.of(plane)
+        channel = channels_of(data, request.selection, axis)
+        order = np.argsort(channel, kind="stable")
+        first = np.searchsorted(channel[order], np.arange(axis.size + 1))
+        blank = np.diff(first) == 0
+        if blank.all():
+            raise ValueError(f"start = {request.grid.start!r}, width = {request.grid.width!r}, nchan = {request.grid.nchan}: "
+                             "no sample that can be used is in these channels")
+        if blank.any():
+            data.notes.append(f"channels {', '.join(map(str, np.flatnonzero(blank)))} are blank: no sample that can be used")
+        if first[0]:
+            log.info(f"{first[0]} samples are in none of the {axis.size} channels")
+        plane = replace(plane, mask=plane.mask & ~blank[:, None, None])
+        images = {name: np.zeros(plane.pb.shape, np.float32) for name in ("psf", "residual", "model")}
+        return cls(request, data, plane, axis, order, first, [Channel(float(freq)) for freq in axis.freqs_hz], images)
+
+    @property
+    def filled(self):
+        """The numbers of the channels that have samples."""
+        return np.flatnonzero(np.diff(self.first)).tolist()
+
+    def make_dirty(self, k):
+        """Make the images of a channel from its first model, which is empty where none is given."""
+        log.info(f"channel {k} of {self.axis.size}, {self.channels[k].freq_hz / 1e9:.9g} GHz {self.axis.frame}")
+        start = self._startmodel(k)
+        model = start if start is not None else np.zeros(self.plane.shape, np.float32)
+        try:
+            part = self._split(k)
+            describe(part.data, part.blocks, part.noise)
+            check_l2bound(self.request.options, len(part.blocks))
+            self._fill(k, part.data, part.blocks, part.noise, None, model)
+        except ValueError as error:
+            raise ValueError(f"channel {k}, {self.channels[k].freq_hz / 1e9:.9g} GHz: {error}") from error
+
+    def solve(self, k, checkpoint, deadline):
+        """Return the solution of a channel."""
+        log.info(f"solving channel {k} of {self.axis.size}")
+        part, request = self._split(k), self.request
+        watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations))
+        return solve_image(part.data, part.offsets, part.noise, None, request.grid, request.options, self._startmodel(k),
+                           checkpoint, watch)
+
+    def take(self, k, reconstruction):
+        """Make the images of a channel from its solution."""
+        part = self._split(k)
+        data, blocks = without_wild(part.data, part.blocks, part.offsets, reconstruction)
+        self._fill(k, data, blocks, part.noise, reconstruction, reconstruction.model)
+
+    def beams(self):
+        """Return the beam of each channel; a blank one has that of the nearest that is not."""
+        filled = np.array(self.filled)
+        return [self.channels[filled[np.abs(filled - k).argmin()]].beam for k in range(self.axis.size)]
+
+    def _split(self, k):
+        samples = self.data.part(self.order[self.first[k] : self.first[k + 1]])
+        return split(replace(samples, dropped={}, notes=[]), self.request.output.blocks)
+
+    def _startmodel(self, k):
+        output = self.request.output
+        return read_model(output.startmodel, self.plane, k) if output.startmodel and not output.resume else None
+
+    def _fill(self, k, data, blocks, noise, reconstruction, model):
+        request, channel = self.request, self.channels[k]
+        found = plane_images(data, model, request.selection, request.grid, request.weighting, request.options, self.plane)
+        for name, pixels in found.pixels.items():
+            self.images[name][k] = pixels
+        channel.sumwt, channel.beam = found.sumwt, found.beam
+        channel.result = Result(Tally(data.size, data.dropped), blocks, noise, reconstruction, found.residual_peak,
+                                found.model_flux, {})
