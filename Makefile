@@ -1,17 +1,21 @@
-# make test, make demo: everything they need is set up on the first call, in $(VENV), offline from then on.
+# make test, make demo, make docs: everything they need is set up on the first call, in $(VENV), offline from then on.
 #   make PYTHON=python3.12 VENV=.venv312 test    another Python, another environment
 
 PYTHON ?= python3
 VENV ?= .venv
 python := $(abspath $(VENV))/bin/python
 
-.PHONY: test demo install tasks clean
+.PHONY: test demo docs install tasks clean
 
 test: install
 	$(python) -m pytest
 
 demo: install
 	$(python) -m casa_sara.demo
+
+# The site, in build/docs; a warning is an error.
+docs: $(VENV)/docs-installed
+	$(python) -m sphinx -q -W --keep-going docs build/docs
 
 install: $(VENV)/installed
 
@@ -49,4 +53,8 @@ $(VENV)/installed: setup.cfg pyproject.toml Makefile
 	$(python) -m pip install --quiet --disable-pip-version-check --editable '.[shell,test]'
 	echo "$$CASA_SITE" > $(VENV)/casasiteconfig.py
 	echo '$(CASA_PTH)' > "$$($(python) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/casa_sara_casasite.pth"
+	touch $@
+
+$(VENV)/docs-installed: $(VENV)/installed
+	$(python) -m pip install --quiet --disable-pip-version-check --editable '.[docs]'
 	touch $@

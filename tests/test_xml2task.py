@@ -61,7 +61,17 @@ SMALL = """<casaxml xmlns="http://casa.nrao.edu/schema/psetTypes.html">
     </constraints>
   </input>
   <returns>dict</returns>
-  <example>small(vis='x.ms')</example>
+  <example>
+    Do it:
+
+    small(vis='x.ms', mode='hard')
+
+    In the shell:
+
+    inp small
+    vis = 'x.ms'
+    go
+  </example>
 </task>
 </casaxml>
 """
@@ -121,6 +131,13 @@ MISTAKES = {
     "constraint on an unknown parameter": ('default param="names"', 'default param="name"', "default name: should"),
     "constraint with another default": (
         '"softness"><value>0.5</value>', '"softness"><value>0.6</value>', "differs from the parameter's own default"),
+    "example without caption": ("Do it:\n", "Do it.\n", "example: should begin with a caption"),
+    "example that is no code": ("small(vis='x.ms', ", "small vis='x.ms', ", "is not Python"),
+    "example without the task": ("small(vis=", "tiny(vis=", "should call small, by keywords only"),
+    "example with an unknown parameter": ("mode='hard')", "mood='hard')", "small has no parameter mood"),
+    "example with a value not allowed": ("mode='hard')", "mode='harder')", "'harder' is not a value of mode"),
+    "example of the shell without end": ("    go\n", "", "should end with go"),
+    "example of the shell with an unknown parameter": ("vis = 'x.ms'", "ms = 'x.ms'", "small has no parameter ms"),
     "empty constraints": ('<when param="steps">', '<when param="steps"/><when param="steps">', "open something"),
 }
 
@@ -158,6 +175,11 @@ def test_mistake_is_refused(tmp_path, mistake):
         taskxml.read_task(write(tmp_path, SMALL.replace(old, new, 1)))
 
 
+def test_examples_are_read_as_written(tmp_path):
+    assert taskxml.read_task(write(tmp_path, SMALL)).examples == (
+        ("Do it:", "small(vis='x.ms', mode='hard')"), ("In the shell:", "inp small\nvis = 'x.ms'\ngo"))
+
+
 def test_sub_parameter_must_stand_behind_its_opener(tmp_path):
     start, end = SMALL.index('    <param type="int" name="steps">'), SMALL.index('    <param type="stringVec"')
     moved = SMALL[:start] + SMALL[end:].replace("    <constraints>", SMALL[start:end] + "    <constraints>")
@@ -175,7 +197,8 @@ def test_error_names_the_file_and_fails_the_command(tmp_path, capsys):
 def test_check_names_every_stale_file_and_writes_nothing(tmp_path, capsys):
     command = ["--root", str(tmp_path)]
     write(tmp_path, SMALL)
-    write(tmp_path, SMALL.replace('name="small"', 'name="tiny"'), "tiny")
+    write(tmp_path, SMALL.replace('name="small"', 'name="tiny"').replace("small(", "tiny(").replace("inp small", "inp tiny"),
+          "tiny")
     assert xml2task.main([*command, "--check"]) == 1
     assert not (tmp_path / "casa_sara").exists()
     assert xml2task.main(command) == 0 and xml2task.main([*command, "--check"]) == 0

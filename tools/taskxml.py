@@ -3,7 +3,7 @@
 The dialect is CASA's own (casatasks/__xml__/*.xml) in these parts: <param> with type, name,
 subparam, mustexist and required (required: may not be left empty); its <shortdescription>,
 <description>, <type> (for type="any"), <value>, and <allowed> of kind enum or range; <constraints>
-with <when>, <equals> or <notequals>, <default>; <returns> and <example>. Anything else is an error,
+with <when>, <equals> or <notequals>, <default>; <returns> and <example>, which taskexample.py describes. Anything else is an error,
 and so is a sub-parameter that nothing opens, that two parameters open or that does not stand right
 behind its opener, a missing or wrong default, a constraint on an unknown value, or a constraint's
 default that differs from the parameter's own.
@@ -16,6 +16,8 @@ import textwrap
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from taskexample import Example, read_examples
 
 __all__ = ["Param", "SCALARS", "Task", "TaskError", "VECTORS", "read_task"]
 
@@ -59,6 +61,7 @@ class Task(NamedTuple):
     params: tuple[Param, ...]
     returns: str
     example: str
+    examples: tuple[Example, ...]
 
 
 def read_task(path: Path) -> Task:
@@ -91,7 +94,21 @@ def _read_root(root: ElementTree.Element, stem: str) -> Task:
     texts = (_text(element, "task") for element in (summary, description, returns, example))
     summary, description, returns, example = texts
     return Task(stem, attributes["category"], _one_line(summary, "task"), description, tuple(params.values()),
-                returns, example)
+                returns, example, _read_example(example, stem, params))
+
+
+def _read_example(text: str, task: str, params: dict[str, Param]) -> tuple[Example, ...]:
+    def check(name, value):
+        if name not in params:
+            raise ValueError(f"{task} has no parameter {name}")
+        if value is not None and params[name].allowed and not (
+                set(value) <= set(params[name].allowed) if isinstance(value, list) else value in params[name].allowed):
+            raise ValueError(f"{value!r} is not a value of {name}")
+
+    try:
+        return read_examples(text, task, check)
+    except ValueError as error:
+        raise TaskError(f"example: {error}") from None
 
 
 def _read_param(element: ElementTree.Element) -> Param:

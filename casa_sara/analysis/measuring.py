@@ -46,7 +46,7 @@ def measure(products, cell_arcsec, beams, truth, support, regions, chi_square=No
 
     Parameters
     ----------
-    products : sequence of Product
+    products : sequence of casa_sara.analysis.comparison.Product
         On one grid.
     cell_arcsec : (float, float)
     beams : dict

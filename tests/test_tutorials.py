@@ -1,0 +1,82 @@
+"""The tutorials run, and give what their pages say."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("casatasks")
+
+TUTORIALS = Path(__file__).resolve().parents[1] / "docs" / "tutorials"
+
+
+def tutorial(name):
+    """Import docs/tutorials/NAME.py."""
+    spec = importlib.util.spec_from_file_location(name, TUTORIALS / f"{name}.py")
+    module = sys.modules[name] = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def drawn(path):
+    return 10_000 < path.stat().st_size < 150_000
+
+
+def test_first_image(tmp_path):
+    module = tutorial("first_image")
+    truth, forecast, result, images = module.main(tmp_path)
+    assert forecast["fits"] and 0.3e9 < forecast["peak_bytes"] < 0.8e9
+    assert result["stopcode"] == 101 and 250 <= result["iterdone"] <= 400
+    assert images["model"].sum() == pytest.approx(12.14, abs=0.15)
+    assert module.snr_at_scale(truth, images["model"], 4) == pytest.approx(20.9, abs=0.5)
+    assert images["image"].max() / images["residual"].std() == pytest.approx(1880, rel=0.15)
+    found = [block["noise_found"] for block in result["sara"]["blocks"]]
+    assert len(found) == 6 and min(found) == pytest.approx(1.31, abs=0.1) and max(found) == pytest.approx(1.64, abs=0.1)
+    module.draw(tmp_path / "picture.png", truth, images)
+    assert drawn(tmp_path / "picture.png")
+    assert "converged" in module.as_text(truth, forecast, result, images)
+
+
+def test_cell_and_blocks(tmp_path):
+    module = tutorial("cell_and_blocks")
+    module.CELLS = (0.25, 0.2)
+    cells, refusal, blocks, truth = module.main(tmp_path)
+    assert [run.snr_beam for run in cells.values()] == pytest.approx([44.1, 44.1], abs=0.7)
+    assert [run.snr_half for run in cells.values()] == pytest.approx([24.9, 25.5], abs=0.5)
+    assert refusal == ("cell=0.4arcsec is too large for the longest baseline, 306.8 klambda: use at most cell=0.3358arcsec")
+    found = [block["noise_found"] for block in blocks[0].blocks]
+    assert found == pytest.approx([1, 1, 1, 10, 10, 10], rel=0.06)
+    assert [block["noise_found"] for block in blocks[1].blocks] == pytest.approx([7.07], rel=0.05)
+    assert blocks[0].snr_beam - blocks[1].snr_beam == pytest.approx(4.8, abs=1)
+    assert blocks[0].snr_half == pytest.approx(27.3, abs=0.7)
+    module.draw(tmp_path / "picture.png", cells, truth)
+    assert drawn(tmp_path / "picture.png")
+    assert refusal in module.as_text(cells, refusal, blocks, truth)
+
+
+def test_calibration_quality(tmp_path):
+    module = tutorial("calibration_quality")
+    before, after, picture = module.main(tmp_path)
+    expected = np.array([1.0] * 6 + [2.0] * 6)
+    assert [block["noise_measured"] for block in before] == pytest.approx(expected, rel=0.06)
+    expected[3] = 1.73
+    assert [block["noise_found"] for block in before] == pytest.approx(expected, rel=0.07)
+    assert [block["noise_found"] for block in after] == pytest.approx(np.delete(expected, 3), rel=0.07)
+    assert drawn(picture)
+    assert "| B.ms, 4 | 1.00 | 1.73 | – |" in module.as_text(before, after)
+
+
+def test_compare_with_tclean(tmp_path):
+    module = tutorial("compare_with_tclean")
+    truth, measures, models = module.main(tmp_path)
+    ours, theirs = measures["products"]["tsara"], measures["products"]["tclean"]
+    assert ours["briggs"]["dr"] == pytest.approx(1910, rel=0.15) and theirs["briggs"]["dr"] == pytest.approx(831, rel=0.15)
+    assert [one["flux_jy"] for one in (ours, theirs)] == pytest.approx([12.12, 11.98], abs=0.15)
+    assert [one["regions"]["core"]["model_flux_jy"] for one in (ours, theirs)] == pytest.approx([0.119, 0.119], abs=0.008)
+    assert measures["similarity"]["briggs"]["tsara|tclean"] == pytest.approx(32.3, abs=1.5)
+    module.draw(tmp_path / "picture.png", truth, models)
+    assert drawn(tmp_path / "picture.png")
+    assert "| tsara | " in module.as_text(truth, measures, models)
+    assert (tmp_path / "compared" / "report.html").exists()
