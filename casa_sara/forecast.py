@@ -76,7 +76,8 @@ class Workload:
         reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples, "while reading": READING * self.samples}
         return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
                 "images of a channel": writing | held,
-                "writing": {"libraries": LIBRARIES, **held, "image planes": self._planes(WRITING * self.channels)}}
+                "writing": {"libraries": LIBRARIES, **held,
+                            "process that writes": self._planes((PLANE + CUBES + 1) * self.channels)}}
 
     def _of_plane(self):
         data = {"libraries": LIBRARIES, "visibilities": (SAMPLE + FREQUENCY * self.frequencies) * self.samples}

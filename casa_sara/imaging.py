@@ -170,7 +170,11 @@ def plane_images(data, model, selection, grid, weighting, options, plane):
     """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of."""
     weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model), weights)
-    return PlaneImages(dict(psf=psf, residual=residual, model=model), sum_of_weights(data, selection, weights), beam)
+    if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the hands, too
+        sumwt = float(weights.sum(dtype=float))
+    else:
+        sumwt = sum_of_weights(data, selection, weights)
+    return PlaneImages(dict(psf=psf, residual=residual, model=model), sumwt, beam)
 
 
 def _save_model(selection, data, grid, options, model):

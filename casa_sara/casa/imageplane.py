@@ -146,18 +146,19 @@ def _make_primary_beam(visibilities, selection, grid, root):
         try:
             imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
         except RuntimeError as error:
-            parameters = (f"imsize = {list(grid.shape)}, projection = '{grid.projection}', {_spectral_words(grid)}, "
-                          f"vis = {list(selection.vis)}")
+            parameters = f"{_axes_words(grid)}, vis = {list(selection.vis)}"
             raise ValueError(f"{parameters}: CASA makes no image of them: {' '.join(str(error).split())}") from error
         imager.makepb()
     finally:
         imager.done()
 
 
-def _spectral_words(grid):
-    """Return the task parameters of the spectral axis, for a message."""
-    names = ("nchan", "start", "width", "outframe", "veltype", "restfreq") if grid.is_cube else ("reffreq",)
-    return ", ".join(f"{name} = {getattr(grid, name)!r}" for name in names)
+def _axes_words(grid):
+    """Return the task parameters that the axes may fail on, for a message."""
+    if grid.is_cube:
+        names = ("nchan", "start", "width", "outframe", "veltype", "restfreq")
+        return ", ".join(f"{name} = {getattr(grid, name)!r}" for name in names)
+    return f"imsize = {list(grid.shape)}, projection = '{grid.projection}', reffreq = '{grid.reffreq}'"
 
 
 def _by_start(visibilities):

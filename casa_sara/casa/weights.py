@@ -3,7 +3,8 @@
 Both count the summed natural weight of the samples in each cell of the uv plane, of side
 1/(n·cell) for an image of n pixels; a sample counts at (u, v) and at (−u, −v). The index of
 a cell is trunc(n·cell·u + n//2) in single precision, where u is in metres times the rounded
-wave number; index 0 and what lies beyond the grid are left out. tclean takes −u for u, LSRK frequencies and the image's size in each axis;
+wave number; index 0 and what lies beyond the grid are left out. tclean takes −u for u, LSRK frequencies and the image's size in each axis,
+and for the channels of a cube it rounds where it truncates otherwise;
 imager takes the frequencies of the data and one size for both axes. Neither turns the
 baselines to the phase centre of the image before it counts. Both also count what they do not
 image, autocorrelations and rows flagged by FLAG_ROW alone; here these are left out.
@@ -106,8 +107,9 @@ def imaging_weights(visibilities, grid, weighting):
         if weighting.npixels > MOST_CELLS:
             raise ValueError(f"npixels = {weighting.npixels}: should be at most {MOST_CELLS}")
         shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
-        cells = _cells(-u, v, shape, grid.cell_rad)
-        counts = _count(cells, _cells(u, -v, shape, grid.cell_rad), weights, shape[0] * shape[1])
+        to_cell = np.rint if grid.is_cube else np.trunc
+        cells = _cells(-u, v, shape, grid.cell_rad, to_cell)
+        counts = _count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights, shape[0] * shape[1])
         if not counts.any():
             raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
         density = counts[cells]
@@ -198,9 +200,9 @@ def _channel_wave_numbers(visibilities):
     return wave_numbers
 
 
-def _cells(u, v, shape, cell_rad):
+def _cells(u, v, shape, cell_rad, to_cell=np.trunc):
     """Return the index of the uv cell of each sample in the flat grid, i + nx·j, 0 where it has none."""
-    i, j = (np.trunc(np.float32(n * cell) * x + np.float32(n // 2)) for n, cell, x in zip(shape, cell_rad, (u, v)))
+    i, j = (to_cell(np.float32(n * cell) * x + np.float32(n // 2)) for n, cell, x in zip(shape, cell_rad, (u, v)))
     inside = (i > 0) & (i < shape[0]) & (j > 0) & (j < shape[1])
     i, j = (np.where(inside, index, 0).astype(np.intp) for index in (i, j))
     return i + shape[0] * j
