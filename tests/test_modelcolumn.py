@@ -41,7 +41,7 @@ def predictor(centre):
     flux, lmn = direction_cosines((CYGNUS_A, centre), SKY)
     l, m, n = lmn[1]
 
-    def predict(uvw):
+    def predict(uvw, freq_hz):
         u, v, w = uvw[:, :, None]
         return np.exp(2j * np.pi * (u * l + v * m + w * (n - 1))) @ flux
 
@@ -108,7 +108,7 @@ def test_only_the_selection_is_written(copied):
     keep = {number: spectral_window(copied, "MODEL_DATA", number) for number in (0, 1)}
     selection = Selection(vis=(str(copied),), spw="0:1;3", scan="2")
     centre = read_visibilities(selection).phase_center
-    write_model_column(selection, centre, lambda uvw: np.full(uvw.shape[1], 7.0))
+    write_model_column(selection, centre, lambda uvw, freq_hz: np.full(uvw.shape[1], 7.0))
     model = spectral_window(copied, "MODEL_DATA", 0)
     rows = spectral_window(copied, "SCAN_NUMBER", 0) == 2
     assert np.array_equal(spectral_window(copied, "MODEL_DATA", 1), keep[1])
@@ -189,9 +189,9 @@ def test_interrupts_wait_until_the_column_is_whole(copied):
     before = signal.signal(signal.SIGTERM, lambda *got: received.append(column(copied, "MODEL_DATA", [0, 5])))
     exact = predictor(CENTRE)
 
-    def interrupted(uvw):
+    def interrupted(uvw, freq_hz):
         os.kill(os.getpid(), signal.SIGTERM)
-        return exact(uvw)
+        return exact(uvw, freq_hz)
 
     try:
         selection = Selection(vis=(str(copied),), spw="0")

@@ -51,9 +51,10 @@ def with_spectrum(grid, plane, reference=None):
     if not grid.spectralindex:
         return grid
     check_spectral_index(grid.spectralindex)
+    plane, reference = (SkyPlane(one.csys, tuple(one.shape)) for one in (plane, reference or plane))
     value = _number(grid.spectralindex)
     index = _index_image(grid.spectralindex, plane) if value is None else value
-    return replace(grid, spectrum=Spectrum(index, _reference_hz(reference or plane)))
+    return replace(grid, spectrum=Spectrum(index, _reference_hz(reference)))
 
 
 def spectral_band(grid, freq_range_hz):
@@ -74,7 +75,7 @@ def _number(text):
 
 def _reference_hz(plane):
     """Return the frequency of the spectral axis."""
-    csys = SkyPlane(plane.csys, tuple(plane.shape)).coordinates()
+    csys = plane.coordinates()
     return float(csys.convert(csys.referencevalue()["numeric"], unitsout=["rad", "rad", "", "Hz"])[3])
 
 
