@@ -19,7 +19,7 @@ SOLVER = 52  # whitened data, density, preconditioner, dual, Φx̄, Φz, spread,
 PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
 WEIGHING = 30  # uv cells and densities
 # image planes, each 4 bytes a pixel
-PLANE = 1.25  # primary beam and mask
+PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
 NORM, NNLS, SOLVING, WRITING = 8, 4, 10, 10
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
@@ -39,12 +39,13 @@ class Workload:
     nthreads: int
     precondition: bool = True
     report: bool = False
+    masked: bool = False
 
     @classmethod
     def of(cls, census, grid, options, report=False):
         """The workload of a census of the data and the task's parameters."""
         return cls(census.samples, census.reach, grid.shape, grid.cell_rad, len(options.wavelets), options.wavelevels,
-                   options.niter, options.nthreads, options.precondition, report)
+                   options.niter, options.nthreads, options.precondition, report, grid.masked)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -71,7 +72,7 @@ class Workload:
         return phases
 
     def _planes(self, count):
-        return int(4 * count * math.prod(self.shape))
+        return int(4 * (count + SUPPORT * self.masked) * math.prod(self.shape))
 
     def _side(self):
         cell = min(self.cell_rad)

@@ -15,8 +15,10 @@ from casa_sara.casa.modelcolumn import save_model_column, write_model_column
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
+from casa_sara.casa.support import read_support
 from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
+from casa_sara.cautions import check_confined, left_outside, thermal_noise
 from casa_sara.deadline import Deadline
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator, check_cell, check_field
@@ -89,13 +91,15 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if not plane.mask.any():
         data.notes.append(f"phasecenter = '{grid.phasecenter}': the primary beam is nowhere in the image above pblimit = "
                           f"{output.pblimit:g}, and its pixels are masked everywhere")
-    for note in data.notes:
-        log.warn(note)
+    _caution(data)
     start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
     if output.images_stand:
         _save_model(selection, data, grid, options, start)
         return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)),
                       forecast.summary())
+    support = read_support(grid, plane)
+    if support is not None and start is not None:
+        start *= support
     # split and weigh
     block_of_sample, blocks = snapshot_blocks(data, output.blocks)
     data, offsets = sort_into_blocks(data, block_of_sample)
@@ -107,7 +111,8 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if options.niter > 0:
         deadline.reserve = _after_iterations(data, grid, output, limits, deadline.elapsed())
         watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
-        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch)
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch,
+                                     support)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         model = reconstruction.model
         data, blocks = without_wild(data, blocks, offsets, reconstruction)
@@ -116,6 +121,9 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
         residual = dirty_image(operator, data.vis - operator.forward(model), weights)
         images = dict(psf=psf, residual=residual, model=model)
+        if support is not None:
+            images["mask"] = check_confined(model, support)
+            _caution(data, left_outside(residual, support, thermal_noise(data, weights, noise, blocks)))
         result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()),
                         float(model.sum(dtype=float)), forecast.summary())
         write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result),
@@ -125,6 +133,13 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if output.savemodel == "modelcolumn":
         _save_model(selection, data, grid, options, model)
     return result
+
+
+def _caution(data, notes=None):
+    """Warn of these notes, which the record keeps too, or of those that are there."""
+    for note in data.notes if notes is None else notes:
+        log.warn(note)
+    data.notes.extend(notes or [])
 
 
 def _save_model(selection, data, grid, options, model):

@@ -44,7 +44,7 @@ class Selection:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """The image plane: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive."""
+    """The image plane: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive; and where the model may be."""
 
     shape: tuple[int, int]
     cell_rad: tuple[float, float]
@@ -52,6 +52,14 @@ class ImageGrid:
     projection: str = "SIN"
     stokes: str = "I"
     reffreq: str = ""
+    usemask: str = "user"
+    mask: tuple[str, ...] = ()
+    pbmask: float = 0.0
+
+    @property
+    def masked(self) -> bool:
+        """Whether the model is confined to a part of the image."""
+        return self.usemask == "pb" or bool(self.mask)
 
 
 @dataclass(frozen=True)

@@ -35,12 +35,14 @@ EXCEPTIONS = {
     ("pblimit", "range"): SURER,
     ("projection", "allowed"): "the projection of an interferometer; others would put sources in wrong places",
     ("reffreq", "types"): "a frequency with its unit; tclean's variant lets anything through",
+    ("pbmask", "range"): SURER,
     ("restart", "default"): "an old model must not enter a new image unasked; tclean's False renames the images",
     ("savemodel", "allowed"): NARROWER,
     ("specmode", "allowed"): NARROWER,
     ("startmodel", "types"): "one image; tclean's list is for Taylor terms",
     ("stokes", "allowed"): NARROWER,
     ("uvtaper", "default"): "[] as tclean's own in the shell; in Python tclean has ['']; both mean none",
+    ("usemask", "allowed"): NARROWER,
     ("weighting", "allowed"): NARROWER,
 }
 

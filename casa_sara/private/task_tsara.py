@@ -39,7 +39,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"]:
         return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
-    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"])
+    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked)
     with one_run_of(parameters["imagename"]):
         recover_products(parameters["imagename"])
         output = _output(parameters)
@@ -87,7 +87,17 @@ def _grid(parameters):
     shape = _pair(parameters["imsize"], "imsize", "one number of pixels, or two")
     cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
-                     parameters["stokes"], parameters["reffreq"])
+                     parameters["stokes"], parameters["reffreq"], parameters["usemask"], _mask(parameters), parameters["pbmask"])
+
+
+def _mask(parameters):
+    """The entries of the mask."""
+    mask = parameters["mask"]
+    entries = tuple(entry for entry in ([mask] if isinstance(mask, str) else mask) if entry.strip())
+    if parameters["usemask"] == "user" and parameters["pbmask"] and not entries:
+        raise ValueError(f"pbmask = {parameters['pbmask']:g} has no effect without a mask, as in tclean: set usemask = 'pb', "
+                         "give a mask, or leave pbmask at 0.0")
+    return entries
 
 
 def _pair(value, name, right):
