@@ -104,7 +104,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     block_of_sample, blocks = snapshot_blocks(data, output.blocks)
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise = noise_from_differences(data, offsets)
-    _describe(data, blocks, noise)
+    _describe(data, blocks, noise, grid.stokes)
     _point_spread(data, grid, weighting, options, plane)  # what cannot be weighed or restored is refused before the hours
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
@@ -126,7 +126,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
             _caution(data, left_outside(residual, support, thermal_noise(data, weights, noise, blocks)))
         result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()),
                         float(model.sum(dtype=float)), forecast.summary())
-        write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result),
+        write_products(output, plane, images, sum_of_weights(data, selection, weights, grid.stokes), beam, record and record(result),
                        child)
     if result.finished or not checkpoint.stands:  # else one of an older run
         checkpoint.remove()
@@ -193,9 +193,9 @@ def _after_iterations(data, grid, output, limits, read_s):
     return writing_seconds(data.size, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
 
-def _describe(data, blocks, noise):
+def _describe(data, blocks, noise, stokes):
     """Say in the log what was read."""
-    log.info(f"{data.size} Stokes I visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
+    log.info(f"{data.size} Stokes {stokes} visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
              f"{len(blocks)} blocks")
     for reason, count in data.dropped.items():
         log.info(f"left out: {count} samples, {reason}")

@@ -28,7 +28,7 @@ def foresee(selection, grid, options, limits):
     """
     resident, available = resident_memory(), available_memory()
     for flags in (False, True):
-        census = take_census(selection, flags)
+        census = take_census(selection, flags, grid.stokes)
         if any(census.reach):  # else there is nothing to read, which reading explains
             check_field(math.hypot(*census.reach), grid.shape, grid.cell_rad)
         work = Workload.of(census, grid, options, limits.report)

@@ -33,12 +33,13 @@ class Census:
     reach: tuple[float, float]
 
 
-def take_census(selection, flags=False):
+def take_census(selection, flags=False, stokes="I"):
     """Count the samples of a selection without its autocorrelations, in the time that the rows' uvw take to read.
 
     Parameters
     ----------
     selection : casa_sara.options.Selection
+    stokes : str
     flags : bool
         Read the flags too, so that the count is exact but for data and weights that are not finite.
 
@@ -47,7 +48,7 @@ def take_census(selection, flags=False):
     Census
     """
     samples, reach = 0, np.zeros(2)
-    for ms in select_data(selection)[0]:
+    for ms in select_data(selection, stokes)[0]:
         with opened("table", ms.name) as tb:
             cross = tb.getcol("ANTENNA1") != tb.getcol("ANTENNA2")
             metres = np.abs(tb.getcol("UVW")[:2])

@@ -31,6 +31,7 @@ ARCSEC = math.pi / 180 / 3600
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     log.info(f"casa_sara {casa_sara.__version__}")
+    _check_stokes(parameters)
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
@@ -88,6 +89,18 @@ def _grid(parameters):
     cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], parameters["usemask"], _mask(parameters), parameters["pbmask"])
+
+
+def _check_stokes(parameters):
+    """Raise on what does not go with Stokes Q, U and V."""
+    stokes = parameters["stokes"]
+    if stokes == "I":
+        return
+    for name, right, reason in (("positivity", False, "it may be negative"),
+                                ("savemodel", "none", "the model column holds what both parallel hands see of Stokes I"),
+                                ("report", False, "a report is of Stokes I")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = {right!r}")
 
 
 def _mask(parameters):

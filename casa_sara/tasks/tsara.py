@@ -19,7 +19,7 @@ PARAMETERS = (
     Parameter('imsize', ('int', 'intVec'), [100], 'Number of pixels', minimum=1.0),
     Parameter('cell', ('int', 'double', 'intVec', 'doubleVec', 'string', 'stringVec'), [], 'Cell size', required=True),
     Parameter('phasecenter', ('int', 'string'), '', 'Phase center of the image'),
-    Parameter('stokes', ('string',), 'I', 'Stokes plane to make', allowed=('I',)),
+    Parameter('stokes', ('string',), 'I', 'Stokes plane to make', allowed=('I', 'Q', 'U', 'V')),
     Parameter('projection', ('string',), 'SIN', 'Coordinate projection', allowed=('SIN',)),
     Parameter('startmodel', ('string',), '', 'Name of starting model image'),
     Parameter('specmode', ('string',), 'mfs', 'Spectral definition mode', allowed=('mfs',)),
@@ -198,9 +198,11 @@ class _tsara:
         Examples: phasecenter='J2000 19h59m28.356 +40d44m02.10'
                   phasecenter=2
 
-    stokes : {'I'}, default 'I'
-        Only Stokes I, from RR and LL, from XX and YY, or from one of the two where only one was
-        recorded. As in tclean, a sample with any correlation flagged is not used.
+    stokes : {'I', 'Q', 'U', 'V'}, default 'I'
+        One of I, Q, U and V. I is formed from RR and LL, from XX and YY, or from one of the two where
+        only one was recorded; Q and U take RL and LR, V takes RR and LL; of linear feeds Q takes XX
+        and YY, U and V take XY and YX. Q, U and V may be negative: they need positivity=False.
+        As in tclean, a sample with any correlation flagged is not used.
 
     projection : {'SIN'}, default 'SIN'
         Only SIN: the projection in which an interferometer sees the sky.
