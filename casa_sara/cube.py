@@ -187,7 +187,7 @@ class _Cube:
         model = start if start is not None else np.zeros(self.plane.shape, np.float32)
         try:
             part = self._split(k)
-            describe(part.data, part.blocks, part.noise)
+            describe(part.data, part.blocks, part.noise, self.request.grid.stokes)
             check_l2bound(self.request.options, len(part.blocks))
             self._fill(k, part.data, part.blocks, part.noise, None, model)
         except ValueError as error:

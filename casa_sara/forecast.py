@@ -22,7 +22,7 @@ PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
 WEIGHING = 30  # uv cells and densities
 SORTING = 12  # of a cube: channels of the samples, and their order
 # image planes, each 4 bytes a pixel
-PLANE = 1.25  # primary beam and mask
+PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
 NORM, NNLS, SOLVING, WRITING = 8, 4, 10, 10
 CUBES = 3  # psf, residual and model of each channel
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
@@ -51,16 +51,16 @@ class Workload:
     max_w: float = 0.0
     frequencies: bool = False
     band: float = 0.0
-
     channels: int = 0
     share: float = 1.0
+    masked: bool = False
 
     @classmethod
     def of(cls, census, grid, options, report=False, band=0.0, channels=0, share=1.0):
         """The workload of a census of the data and the task's parameters."""
         return cls(census.samples, census.reach, grid.shape, grid.cell_rad, len(options.wavelets), options.wavelevels,
                    options.niter, options.nthreads, options.precondition, report, grid.gridder, census.max_w,
-                   bool(grid.spectralindex), band, channels, share)
+                   bool(grid.spectralindex), band, channels, share, grid.masked)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -106,7 +106,7 @@ class Workload:
         return phases
 
     def _planes(self, count):
-        return int(4 * count * math.prod(self.shape))
+        return int(4 * (count + SUPPORT * self.masked) * math.prod(self.shape))
 
     def _side(self):
         cell = min(self.cell_rad)

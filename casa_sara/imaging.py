@@ -16,8 +16,10 @@ from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.products import write_products
 from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.spectrum import with_spectrum
+from casa_sara.casa.support import read_support
 from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
+from casa_sara.cautions import check_confined, left_outside, thermal_noise
 from casa_sara.deadline import Deadline
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import check_cell, check_field
@@ -76,9 +78,10 @@ class Split:
 
 @dataclass
 class PlaneImages:
-    """The images of one plane: `pixels` are 'psf', 'residual' and 'model', float32 (nx, ny)."""
+    """The images of one plane: `pixels` are 'psf', 'residual' and 'model', float32 (nx, ny); `weights` (M,) made them."""
 
     pixels: dict[str, np.ndarray]
+    weights: np.ndarray
     sumwt: float
     beam: dict
 
@@ -123,17 +126,19 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     grid = with_spectrum(grid, plane)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
-    for note in data.notes:
-        log.warn(note)
+    _caution(data)
     start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
     if output.images_stand:
         _save_model(selection, data, grid, options, start)
         return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)),
                       forecast.summary())
+    support = read_support(grid, plane)
+    if support is not None and start is not None:
+        start *= support
     # split and weigh
     part = split(data, output.blocks)
     data, blocks, offsets, noise = part.data, part.blocks, part.offsets, part.noise
-    describe(data, blocks, noise)
+    describe(data, blocks, noise, grid.stokes)
     if grid.gridder == "wproject":
         log.info(WTerm.of(data.max_w, grid.shape, grid.cell_rad, operator_accuracy(data, offsets, noise)).words)
     _point_spread(data, grid, weighting, options, plane)  # what cannot be weighed or restored is refused before the hours
@@ -142,13 +147,18 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if options.niter > 0:
         deadline.reserve = _after_iterations(data, grid, output, limits, deadline.elapsed())
         watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
-        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch)
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch,
+                                     support)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         model = reconstruction.model
         data, blocks = without_wild(data, blocks, offsets, reconstruction)
     # write
     with waiting_child() as child:  # which starts meanwhile
         images = plane_images(data, model, selection, grid, weighting, options, plane)
+        if support is not None:
+            images.pixels["mask"] = check_confined(model, support)
+            sigma = thermal_noise(data, images.weights, noise, blocks)
+            _caution(data, left_outside(images.pixels["residual"], support, sigma))
         result = Result(data, blocks, noise, reconstruction, images.residual_peak, images.model_flux, forecast.summary())
         write_products(output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
     if result.finished or not checkpoint.stands:  # else one of an older run
@@ -173,8 +183,15 @@ def plane_images(data, model, selection, grid, weighting, options, plane):
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the hands, too
         sumwt = float(weights.sum(dtype=float))
     else:
-        sumwt = sum_of_weights(data, selection, weights)
-    return PlaneImages(dict(psf=psf, residual=residual, model=model), sumwt, beam)
+        sumwt = sum_of_weights(data, selection, weights, grid.stokes)
+    return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, sumwt, beam)
+
+
+def _caution(data, notes=None):
+    """Warn of these notes, which the record keeps too, or of those that are there."""
+    for note in data.notes if notes is None else notes:
+        log.warn(note)
+    data.notes.extend(notes or [])
 
 
 def _save_model(selection, data, grid, options, model):
@@ -244,9 +261,9 @@ def nowhere_visible(grid, output):
             f"{output.pblimit:g}, and its pixels are masked everywhere")
 
 
-def describe(data, blocks, noise):
+def describe(data, blocks, noise, stokes):
     """Say in the log what was read."""
-    log.info(f"{data.size} Stokes I visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
+    log.info(f"{data.size} Stokes {stokes} visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
              f"{len(blocks)} blocks")
     for reason, count in data.dropped.items():
         log.info(f"left out: {count} samples, {reason}")

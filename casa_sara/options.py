@@ -59,7 +59,7 @@ class ImageGrid:
     """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
 
     `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis are '', a
-    channel number or a quantity; `nchan` is -1 where the data tell it.
+    channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say where the model may be.
     """
 
     shape: tuple[int, int]
@@ -79,11 +79,19 @@ class ImageGrid:
     veltype: str = "radio"
     restfreq: tuple[str, ...] = ()
     interpolation: str = "nearest"
+    usemask: str = "user"
+    mask: tuple[str, ...] = ()
+    pbmask: float = 0.0
 
     @property
     def is_cube(self) -> bool:
         """Whether the image has a plane for each channel."""
         return self.specmode == "cube"
+
+    @property
+    def masked(self) -> bool:
+        """Whether the model is confined to a part of the image."""
+        return self.usemask == "pb" or bool(self.mask)
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ class Findings:
 
 @dataclass
 class Problem:
-    """Whitened samples y = √w·V, and the operators that belong to them."""
+    """Whitened samples y = √w·V, the operators that belong to them, and the pixels that may be other than zero (None: all)."""
 
     samples: Samples
     vis: np.ndarray
@@ -60,9 +60,10 @@ class Problem:
     precond: np.ndarray
     data_norm_sq: float
     unit_jy: float
+    support: np.ndarray | None = None
 
     @classmethod
-    def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None):
+    def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None, support=None):
         """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`; measure its norm unless given."""
         data = samples.data
         sqrt_weight = np.sqrt(data.weight)
@@ -74,7 +75,7 @@ class Problem:
         if data_norm_sq is None:
             data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),
                                         grid.shape, dtype=np.float32)
-        return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy)
+        return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support)
 
 
 def first_image(samples, problem_of, options, stopped=lambda: False):
@@ -101,7 +102,7 @@ def first_image(samples, problem_of, options, stopped=lambda: False):
     for _ in range(ROUNDS):
         problem = problem_of(samples)
         first, residual = nnls(problem.measurement, problem.vis, problem.precond, problem.data_norm_sq,
-                               positivity=options.positivity, stopped=stopped)
+                               positivity=options.positivity, stopped=stopped, support=problem.support)
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)))
         if found.index.size == 0:

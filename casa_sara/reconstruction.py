@@ -61,7 +61,7 @@ class Reconstruction:
 
 
 def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=None,
-                progress=lambda ppd, record: None, stopped=lambda: False, checkpoint=None):
+                progress=lambda ppd, record: None, stopped=lambda: False, checkpoint=None, support=None):
     """Find the SARA image of block-sorted visibilities.
 
     Parameters
@@ -83,6 +83,8 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     checkpoint : Checkpoint, optional
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
         whose NNLS fit was cut short is not kept: it is not on the way to the same image.
+    support : bool (nx, ny), optional
+        The model is exactly 0 elsewhere.
 
     Returns
     -------
@@ -97,10 +99,12 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     samples = Samples(data, np.asarray(offsets), density, np.arange(data.size))
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(np.mean(data.weight, dtype=float) ** -0.5)
-    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, eps=operator_accuracy(data, offsets, noise))
+    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support,
+                         eps=operator_accuracy(data, offsets, noise))
     if checkpoint is not None:
         checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, blocks=samples.offsets,
-                            density=density, noise=noise, spectralindex=grid.spectrum and np.asarray(grid.spectrum.index))
+                            density=density, noise=noise, support=support,
+                            spectralindex=grid.spectrum and np.asarray(grid.spectrum.index))
     if checkpoint is not None and checkpoint.state is not None:
         solution = _resume(samples, problem_of, options, noise, checkpoint)
     else:
@@ -143,6 +147,8 @@ class _Solution:
         ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.samples.offsets, problem.precond,
                           found.data_norm_sq, options.positivity)
         ppd.unit_jy = unit_jy
+        if problem.support is not None:
+            ppd.confine(problem.support)
         weights = problem.samples.data.weight * np.float32(unit_jy**2)
         return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, noise, options))
 
@@ -158,6 +164,8 @@ def _begin(samples, problem_of, options, noise, startmodel, stopped):
     found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
     if startmodel is not None:
         first = startmodel / np.float32(problem.unit_jy)
+        if problem.support is not None:
+            first *= problem.support
     solution.ppd.start_from(first)
     solution.ppd.rescale(STEP_BALANCE * _mean_brightness(first))
     return solution

@@ -36,7 +36,7 @@ def foresee(selection, grid, options, limits):
     resident, available = resident_memory(), available_memory()
     channels, share = _channels(selection, grid)
     for flags in (False, True):
-        census = take_census(selection, flags)
+        census = take_census(selection, flags, grid.stokes)
         if any(census.reach):  # else there is nothing to read, which reading explains
             check_field(math.hypot(*census.reach), grid.shape, grid.cell_rad)
         band = spectral_band(grid, census.freq_range_hz)

@@ -44,7 +44,8 @@ def checkpoint_of(selection, grid, options, output):
     return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
 
 
-def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None):
+def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None,
+                support=None):
     """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
 
     Parameters
@@ -63,6 +64,8 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     checkpoint : Checkpoint, optional
         Where the state is kept now and then, or was.
     watch : Watch, optional
+    support : bool (nx, ny), optional
+        The model is 0 elsewhere.
 
     Returns
     -------
@@ -82,7 +85,7 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
 
     with stop_on_interrupt() as pressed:
         reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
-                                     lambda: pressed() or bool(watch and watch.deadline.near()), checkpoint)
+                                     lambda: pressed() or bool(watch and watch.deadline.near()), checkpoint, support)
     progress.close()
     record = reconstruction.record
     if record.stop_code == STOPPED_BY_USER and not pressed():

@@ -419,8 +419,8 @@ def test_bad_vis(observation, tmp_path):
         read(tmp_path / "junk.ms")
     with pytest.raises(ValueError, match="FIELD' is a CASA table, but not a MeasurementSet"):
         read(observation + "/FIELD")
-    with pytest.raises(ValueError, match="stokes = 'V'"):
-        read_visibilities(Selection(vis=(observation,)), stokes="V")
+    with pytest.raises(ValueError, match="stokes = 'RR'"):
+        read_visibilities(Selection(vis=(observation,)), stokes="RR")
 
 
 def test_measurement_set_without_rows(observation, tmp_path):

@@ -38,6 +38,7 @@ ROOMS = {
     "options": set(),
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
+    "cautions": {"casa_sara.visibilities", "numpy"},
     "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
     "casa": {"casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
     "operators": {
@@ -47,7 +48,7 @@ ROOMS = {
     "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
     "jsonfile": set(),
 }
-LIBRARY = ("options", "visibilities", "noise", "outliers", "problem", "operators", "solver", "analysis")
+LIBRARY = ("options", "visibilities", "noise", "cautions", "outliers", "problem", "operators", "solver", "analysis")
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["forecast"] = {"casa_sara.operators"}

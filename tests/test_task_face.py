@@ -36,12 +36,14 @@ EXCEPTIONS = {
     ("pblimit", "range"): SURER,
     ("projection", "allowed"): "the projection of an interferometer; others would put sources in wrong places",
     ("reffreq", "types"): "a frequency with its unit; tclean's variant lets anything through",
+    ("pbmask", "range"): SURER,
     ("restart", "default"): "an old model must not enter a new image unasked; tclean's False renames the images",
     ("savemodel", "allowed"): NARROWER,
     ("specmode", "allowed"): NARROWER,
     ("startmodel", "types"): "one image; tclean's list is for Taylor terms",
     ("stokes", "allowed"): NARROWER,
     ("uvtaper", "default"): "[] as tclean's own in the shell; in Python tclean has ['']; both mean none",
+    ("usemask", "allowed"): NARROWER,
     ("weighting", "allowed"): NARROWER,
     ("wprojplanes", "default"): "tclean's 1 leaves the w-term out of gridder='wproject'; here -1, as no number is needed",
     ("wprojplanes", "range"): SURER,
@@ -258,7 +260,7 @@ def test_python_and_numpy_values_are_taken(received):
         ({"imsize": "64"}, "imsize = '64': should be an integer or a list of integers"),
         ({"weighting": "Briggs"}, "weighting = 'Briggs': should be a string out of 'natural', 'uniform', 'briggs'"),
         ({"wavelets": ["db1", "x"]}, r"wavelets = \['db1', 'x'\]: should be a list of strings out of 'dirac', 'db1'"),
-        ({"stokes": "IQUV"}, "stokes = 'IQUV': should be 'I', the only choice"),
+        ({"stokes": "IQUV"}, "stokes = 'IQUV': should be a string out of 'I', 'Q', 'U', 'V'"),
         ({"parallel": True}, "parallel = True: should be False, the only choice"),
         ({"positivity": 1}, "positivity = 1: should be True or False"),
         ({"field": 3}, "field = 3: should be a string or a list of strings"),
@@ -278,7 +280,7 @@ def test_missing_path_is_named(received, vis):
 
 def test_every_problem_is_named(received):
     with pytest.raises(ValueError) as error:
-        tsara(vis="nosuch.ms", cell="1arcsec", niter="all", stokes="V")
+        tsara(vis="nosuch.ms", cell="1arcsec", niter="all", stokes="RR")
     names = [line.split(" = ")[0] for line in str(error.value).splitlines()]
     assert names == ["vis", "imagename", "stokes", "niter"]
 

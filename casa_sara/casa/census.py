@@ -39,12 +39,13 @@ class Census:
     freq_range_hz: tuple[float, float] = (0.0, 0.0)
 
 
-def take_census(selection, flags=False):
+def take_census(selection, flags=False, stokes="I"):
     """Count the samples of a selection without its autocorrelations, in the time that the rows' uvw take to read.
 
     Parameters
     ----------
     selection : casa_sara.options.Selection
+    stokes : str
     flags : bool
         Read the flags too, so that the count is exact but for data and weights that are not finite.
 
@@ -53,7 +54,7 @@ def take_census(selection, flags=False):
     Census
     """
     samples, reach, freqs_hz = 0, np.zeros(3), []
-    for ms in select_data(selection)[0]:
+    for ms in select_data(selection, stokes)[0]:
         with opened("table", ms.name) as tb:
             cross = tb.getcol("ANTENNA1") != tb.getcol("ANTENNA2")
             metres = np.abs(tb.getcol("UVW"))

@@ -1,4 +1,4 @@
-"""Stokes I visibilities out of MeasurementSets."""
+"""Visibilities of one Stokes parameter out of MeasurementSets."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from casa_sara.visibilities import RowTable, Visibilities
 
 __all__ = ["read_visibilities"]
 
+STOKES = ("I", "Q", "U", "V")
 _CHUNK = 400_000  # complex numbers read at a time
 _ONE_POINTING = 1e-6  # rad; fields closer than this share their primary beam
 _WIDEST_BEAM = 10.0  # degrees; no field is farther from the image's centre
@@ -31,9 +32,14 @@ _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw"
 
 
 def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
-    """Read, select, flag, average to Stokes I and turn to one phase centre.
+    """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
 
-    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one hand there is. A sample is left out
+    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one hand there is, and as tclean (of circular, or of linear feeds)
+
+        V_Q = (V_RL + V_LR)/2,  (V_XX − V_YY)/2;    V_U = (V_RL − V_LR)/2i,  (V_XY + V_YX)/2;
+        V_V = (V_RR − V_LL)/2,  (V_XY − V_YX)/2i.
+
+    A sample is left out
     when any of its correlations is flagged (cross-hands too, as in tclean), when its row is
     flagged or an autocorrelation, and when data, weights or uvw cannot be used; what was left
     out is counted by the first reason that applies. Weights are WEIGHT_SPECTRUM where it is
@@ -41,7 +47,8 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
 
     The inverse variance of Re V_I and of Im V_I follows from those of the hands:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
-    WEIGHT = 1/SIGMA² with SIGMA the scatter of the real and of the imaginary part.
+    WEIGHT = 1/SIGMA² with SIGMA the scatter of the real and of the imaginary part. The same holds for Q, U and V of
+    theirs. tclean's imaging weight is the mean of the parallel hands, whatever the Stokes parameter.
 
     The MeasurementSets are opened read-only and stay as they are, byte by byte.
 
@@ -51,7 +58,7 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
     phasecenter : str or int
         Image centre in tclean's words; '' is the first selected field's.
     stokes : str
-        Only 'I'.
+        'I', 'Q', 'U' or 'V'.
     frequencies : bool
         Keep the frequency of each sample.
 
@@ -64,9 +71,9 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
     ValueError, FileNotFoundError
         When there is nothing to image, or what was asked for is not in the data.
     """
-    if stokes != "I":
-        raise ValueError(f"stokes = '{stokes}' cannot be imaged: only stokes = 'I' can")
-    selected, notes = select_data(selection)
+    if stokes not in STOKES:
+        raise ValueError(f"stokes = '{stokes}' cannot be imaged: should be one of {', '.join(STOKES)}")
+    selected, notes = select_data(selection, stokes)
     image = image_direction(phasecenter, selected)
     _check_directions(phasecenter, image, selected)
     table = _SampleTable(frequencies)
@@ -99,13 +106,14 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
 
 @dataclass
 class _Chunk:
-    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand of Stokes I."""
+    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `parallel` the parallel hands' weights."""
 
     rows: np.ndarray
     columns: dict[str, np.ndarray]
     uvw_m: np.ndarray
     vis: list[np.ndarray]
     weight: list[np.ndarray]
+    parallel: list[np.ndarray]
     flag: np.ndarray
     flag_row: np.ndarray
 
@@ -137,13 +145,14 @@ def _read(part, rows, column, weights, group):
         weight = [np.broadcast_to(row[:, None], (rows.size, group.channels.size)) for row in part.getcol("WEIGHT")]
     else:
         weight = planes(weights)
-    vis = planes(column)
+    vis, of_hands = planes(column), [weight[hand] for hand in group.hands]
     return _Chunk(
         rows=rows,
         columns={name: part.getcol(of_ms) for name, of_ms in _ROW_COLUMNS.items()},
         uvw_m=part.getcol("UVW"),
         vis=[vis[hand] for hand in group.hands],
-        weight=[weight[hand] for hand in group.hands],
+        weight=of_hands,
+        parallel=of_hands if group.parallel == group.hands else [weight[hand] for hand in group.parallel],
         flag=np.any(planes("FLAG"), axis=0),
         flag_row=part.getcol("FLAG_ROW"),
     )
@@ -174,7 +183,9 @@ class _SampleTable:
         kept = ok.any(axis=1)
         uvw, shift = geometry.wavelengths(group, columns["field"], columns["time"], np.where(kept, chunk.uvw_m, 0.0))
         hands = len(chunk.vis)
-        vis = sum(hand[ok] for hand in chunk.vis) / hands
+        vis = chunk.vis[0][ok]
+        if hands == 2:
+            vis = (vis + group.sign * chunk.vis[1][ok]) / group.divisor
         if shift is not None:
             vis *= np.exp(-2j * np.pi * shift[ok])
         weight = [hand[ok] for hand in chunk.weight]
@@ -183,7 +194,7 @@ class _SampleTable:
         new = {
             "vis": vis.astype(np.complex64),
             "weight": (hands**2 / sum(1 / hand for hand in weight)).astype(np.float32),
-            "imaging_weight": (sum(weight) / hands).astype(np.float32),
+            "imaging_weight": (sum(hand[ok] for hand in chunk.parallel) / len(chunk.parallel)).astype(np.float32),
             "uvw": np.array([axis[ok] for axis in uvw]),
             "row": np.repeat(number, ok.sum(axis=1)).astype(np.int32),
             "chan": channel[ok].astype(np.int16),

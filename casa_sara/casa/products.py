@@ -1,5 +1,5 @@
 """What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
-(.image.pbcor .model.pbcor), and the record .sara.json.
+(.mask .image.pbcor .model.pbcor), and the record .sara.json.
 
 They appear together. They are written in `.<name>.new`, beside their places; when all are complete and on the disk, the
 folder is renamed `.<name>.whole`, and from then on they are the products: the older ones go to `.<name>.old`, the
@@ -33,7 +33,7 @@ __all__ = [
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-ON_REQUEST = (".image.pbcor", ".model.pbcor")
+ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor")
 CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
 
@@ -147,7 +147,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     plane : ImagePlane
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
-        residual in Jy/beam) and 'model' in Jy/pixel.
+        residual in Jy/beam) and 'model' in Jy/pixel; 'mask' where there is one.
     sumwt : float, or one for each channel
     beam : dict
         Of `restore.fit_beam`, or a list with one for each channel.
@@ -161,7 +161,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     OSError
         The images could not be written, as on a full disk; everything is as it was before.
     """
-    more = 2 * output.pbcor
+    more = 2 * output.pbcor + ("mask" in images)
     check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
@@ -184,6 +184,8 @@ def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor
     write_image(root + ".sumwt", sumwt.reshape(-1, 1, 1), plane)
     if restoringbeam is not None:
         restore(root, restoringbeam, "cube" if plane.pb.ndim == 3 else "mfs")
+    if "mask" in images:
+        write_image(root + ".mask", images["mask"], plane)
     if pbcor:
         write_corrected(root, plane, images["model"])
     for path in existing_products(root):

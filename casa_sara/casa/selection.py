@@ -21,8 +21,14 @@ __all__ = ["RowGroup", "SelectedMS", "select_data"]
 _DATA_COLUMNS = {"corrected": "CORRECTED_DATA", "data": "DATA", "observed": "DATA"}
 _STOKES_CODES = {1: "I", 5: "RR", 6: "RL", 7: "LR", 8: "LL", 9: "XX", 10: "XY", 11: "YX", 12: "YY"}
 _LAST_CHANNEL = 32767
-_HANDS = ({5, 8}, {9, 12})
 _SINGLE = {1, 5, 8, 9, 12}
+# Stokes parameter → ways to form it: two correlations a and b, s and d of (a + s·b)/d
+_FORMED = {
+    "I": ((5, 8, 1, 2), (9, 12, 1, 2)),
+    "Q": ((6, 7, 1, 2), (9, 12, -1, 2)),
+    "U": ((6, 7, -1, 2j), (10, 11, 1, 2)),
+    "V": ((5, 8, -1, 2), (10, 11, -1, 2j)),
+}
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,9 @@ class RowGroup:
     channels : int64 (C,), selected channel numbers, increasing
     freqs_hz, widths_hz : float64 (C,), centres and widths in `frame`
     frame : str, reference of the frequencies ('TOPO', 'LSRK', …)
-    hands : tuple of one or two int, where Stokes I's correlations stand
+    hands : tuple of one or two int, where the correlations stand that form the Stokes parameter
+    sign, divisor : it is (first + sign·second)/divisor
+    parallel : tuple of int, where the parallel hands stand, whose weights are tclean's imaging weights
     correlations : tuple of str, all the correlations of the rows
     """
 
@@ -48,6 +56,9 @@ class RowGroup:
     frame: str
     hands: tuple[int, ...]
     correlations: tuple[str, ...]
+    sign: int = 1
+    divisor: complex = 2
+    parallel: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -75,12 +86,14 @@ class SelectedMS:
     start_s: float
 
 
-def select_data(selection):
+def select_data(selection, stokes="I"):
     """Apply the selection to every MeasurementSet.
 
     Parameters
     ----------
     selection : casa_sara.options.Selection
+    stokes : str
+        'I', 'Q', 'U' or 'V'.
 
     Returns
     -------
@@ -104,7 +117,7 @@ def select_data(selection):
                 empty.append(f"{in_words(selection.of(number))} leaves no rows of '{name}'")
                 continue
             column = _data_column(name, selection.datacolumn, notes)
-            selected.append(_describe(number, name, column, rows, channels, notes))
+            selected.append(_describe(number, name, column, rows, (channels, stokes), notes))
     if not selected:
         raise ValueError("the data selection leaves nothing to image: " + "; ".join(empty))
     return selected, notes + [f"{reason}: nothing of it is imaged" for reason in empty]
@@ -145,8 +158,9 @@ def _data_column(name, datacolumn, notes):
     raise ValueError(f"datacolumn = '{datacolumn}': '{name}' has neither {wanted} nor DATA")
 
 
-def _describe(number, name, column, rows, channels, notes):
-    """Return the SelectedMS of these rows."""
+def _describe(number, name, column, rows, wanted, notes):
+    """Return the SelectedMS of these rows, of the channels and the Stokes parameter `wanted`."""
+    channels, stokes = wanted
     with opened("table", name) as tb:
         description = tb.getcol("DATA_DESC_ID")[rows]
         field_ids = np.unique(tb.getcol("FIELD_ID")[rows])
@@ -172,7 +186,7 @@ def _describe(number, name, column, rows, channels, notes):
                     freqs_hz=md.chanfreqs(spw)[chosen],
                     widths_hz=np.abs(md.chanwidths(spw))[chosen],
                     frame=md.reffreq(spw)["refer"],
-                    hands=_parallel_hands(name, spw, codes, notes),
+                    **_formation(name, spw, codes, stokes, notes),
                     correlations=tuple(_STOKES_CODES.get(code, str(code)) for code in codes),
                 )
             )
@@ -196,22 +210,24 @@ def _position(md, observation):
         return md.antennaposition(0)
 
 
-def _parallel_hands(name, spw, codes, notes):
-    """Return where in `codes` the correlations stand whose mean is Stokes I."""
-    for pair in _HANDS:
-        if pair <= set(codes):
-            return tuple(codes.index(code) for code in sorted(pair))
-    if len(codes) == 1 and codes[0] in _SINGLE:
+def _formation(name, spw, codes, stokes, notes):
+    """Return how a Stokes parameter is formed of the correlations `codes`: hands, sign, divisor and parallel hands."""
+    parallel = tuple(codes.index(code) for code in (5, 8, 9, 12) if code in codes)
+    for first, second, sign, divisor in _FORMED[stokes]:
+        if {first, second} <= set(codes):
+            return dict(hands=(codes.index(first), codes.index(second)), sign=sign, divisor=divisor, parallel=parallel)
+    if stokes == "I" and len(codes) == 1 and codes[0] in _SINGLE:
         if codes[0] != 1:
             hand = _STOKES_CODES[codes[0]]
             note = f"'{name}' holds {hand} alone: it is imaged as Stokes I, as if the source were unpolarised"
             if note not in notes:
                 notes.append(note)
-        return (0,)
+        return dict(hands=(0,), divisor=1, parallel=(0,))
     names = ", ".join(_STOKES_CODES.get(code, f"type {code}") for code in codes)
+    ways = ", or ".join(f"{_STOKES_CODES[first]} and {_STOKES_CODES[second]}" for first, second, *_ in _FORMED[stokes])
     raise ValueError(
-        f"stokes = 'I' cannot be formed from the correlations {names} of spw {spw} in '{name}': "
-        "it takes RR and LL, or XX and YY, or one of them alone; other spws can be selected with spw"
+        f"stokes = '{stokes}' cannot be formed from the correlations {names} of spw {spw} in '{name}': "
+        f"it takes {ways}{', or one of them alone' if stokes == 'I' else ''}; other spws can be selected with spw"
     )
 
 

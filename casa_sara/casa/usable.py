@@ -37,15 +37,16 @@ class Usability:
         noise); baselines of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
         """
         ok = np.ones(chunk.flag.shape, dtype=bool)
+        weights = chunk.weight if chunk.parallel is chunk.weight else [*chunk.weight, *chunk.parallel]
         self._leave_out(ok, "autocorrelation", (chunk.columns["antenna1"] == chunk.columns["antenna2"])[:, None])
         self._leave_out(ok, "flagged row", chunk.flag_row[:, None])
         self._leave_out(ok, "flagged", chunk.flag)
         self._leave_out(ok, "non-finite data", ~np.all([np.isfinite(hand) for hand in chunk.vis], axis=0))
-        self._leave_out(ok, "non-finite weight", ~np.all([np.isfinite(hand) for hand in chunk.weight], axis=0))
-        self._leave_out(ok, "non-positive weight", np.any([hand <= 0 for hand in chunk.weight], axis=0))
+        self._leave_out(ok, "non-finite weight", ~np.all([np.isfinite(hand) for hand in weights], axis=0))
+        self._leave_out(ok, "non-positive weight", np.any([hand <= 0 for hand in weights], axis=0))
         self._leave_out(ok, "non-finite uvw", ~np.isfinite(chunk.uvw_m).all(axis=0)[:, None])
         self._leave_out(ok, "impossible uvw", _is_impossible(chunk.uvw_m)[:, None])
-        self._leave_out(ok, "impossible weight", _is_wild_weight(chunk.weight, ok))
+        self._leave_out(ok, "impossible weight", _is_wild_weight(weights, ok))
         strength = [_strength(vis, weight, ok) for vis, weight in zip(chunk.vis, chunk.weight)]
         self._leave_out(ok, "impossible data", _is_wild_data(strength, ok))
         self.strongest = max([self.strongest, *(hand.max(where=ok, initial=0.0) for hand in strength)])

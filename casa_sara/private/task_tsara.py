@@ -34,6 +34,7 @@ ARCSEC = math.pi / 180 / 3600
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     log.info(f"casa_sara {casa_sara.__version__}")
+    _check_stokes(parameters)
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
@@ -43,7 +44,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"]:
         return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
-    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"])
+    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked)
     with one_run_of(parameters["imagename"]):
         recover_products(parameters["imagename"])
         output = _output(parameters)
@@ -99,7 +100,8 @@ def _grid(parameters):
     cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
-                     spectralindex=_spectral_index(parameters), **_spectral(parameters))
+                     spectralindex=_spectral_index(parameters), usemask=parameters["usemask"], mask=_mask(parameters),
+                     pbmask=parameters["pbmask"], **_spectral(parameters))
 
 
 def _spectral_index(parameters):
@@ -129,11 +131,38 @@ def _refuse_for_cubes(parameters):
     if parameters["savemodel"] != "none":
         raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written from "
                          "continuum images only; should be 'none'")
+    if parameters["stokes"] != "I":
+        raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes are of Stokes I; should be 'I'")
+    if parameters["usemask"] == "pb" or parameters["mask"]:
+        raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': masks "
+                         "are of continuum images only; should be usemask = 'user', mask = ''")
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': the uv cell of a channel is that of the "
                          "image; should be 0")
     if parameters["report"]:
         raise ValueError("report = True with specmode = 'cube': the report is of one image; should be False")
+
+
+def _check_stokes(parameters):
+    """Raise on what does not go with Stokes Q, U and V."""
+    stokes = parameters["stokes"]
+    if stokes == "I":
+        return
+    for name, right, reason in (("positivity", False, "it may be negative"),
+                                ("savemodel", "none", "the model column holds what both parallel hands see of Stokes I"),
+                                ("report", False, "a report is of Stokes I")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = {right!r}")
+
+
+def _mask(parameters):
+    """The entries of the mask."""
+    mask = parameters["mask"]
+    entries = tuple(entry for entry in ([mask] if isinstance(mask, str) else mask) if entry.strip())
+    if parameters["usemask"] == "user" and parameters["pbmask"] and not entries:
+        raise ValueError(f"pbmask = {parameters['pbmask']:g} has no effect without a mask, as in tclean: set usemask = 'pb', "
+                         "give a mask, or leave pbmask at 0.0")
+    return entries
 
 
 def _pair(value, name, right):

@@ -48,6 +48,8 @@ def update_dual(dual, phi_bar, vis, precond, spread, multiplier, relaxation, sta
 def primal_step(model, anchor, model_bar, data_gradient, prior_gradient, steps, lowest, sums, worker, workers):
     """z ← z + ρ(x − z), x⁺ = max(z − τ(ηΦ†v + Ψu), lowest), x̄ = 2x⁺ − z; steps are τ, η, ρ.
 
+    Where lowest is +∞, x⁺ = 0.
+
     Row i of `sums` becomes Σ(x⁺ − x)², Σ(x⁺)², Σx⁺ and max x⁺ of row i of the image.
     """
     tau, l2_step, relaxation = steps
@@ -59,7 +61,7 @@ def primal_step(model, anchor, model_bar, data_gradient, prior_gradient, steps, 
             start = anchor[i, k] + relaxation * (old - anchor[i, k])
             new = start - tau * (l2_step * data_gradient[i, k] + prior_gradient[i, k])
             if new < lowest[i, k]:  # NaN stays NaN, and is found
-                new = lowest[i, k]
+                new = lowest[i, k] if lowest[i, k] < np.inf else model.dtype.type(0)
             difference = new - old
             anchor[i, k] = start
             model[i, k] = new

@@ -66,7 +66,7 @@ class AdaptivePPD:
     anchor : real (nx, ny)
         z.
     lowest : real (nx, ny)
-        Least value of each pixel: 0, or −∞ without positivity.
+        Least value of each pixel: 0, or −∞ without positivity; +∞ for pixels that stay 0, see :meth:`confine`.
     l1_dual, l2_dual
         u and v.
     l1_weights
@@ -118,11 +118,16 @@ class AdaptivePPD:
         """Yield (start, stop) of every block."""
         return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
+    def confine(self, support):
+        """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}."""
+        self.lowest[~support] = np.inf
+
     def start_from(self, model):
-        """Set x, z and x̄ to `model`; the dual variables stay."""
+        """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay."""
         self.model[...] = model
-        self.anchor[...] = model
-        self.model_bar[...] = model
+        self.model[self.lowest == np.inf] = 0
+        self.anchor[...] = self.model
+        self.model_bar[...] = self.model
         self.measurement.forward(self.model, self._phi_anchor)
 
     def step(self):

@@ -15,7 +15,7 @@ PATH = 0.75  # of the iterations, over which the penalty falls
 
 
 def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last_penalty=1e-3, positivity=True,
-         stopped=lambda: False):
+         stopped=lambda: False, support=None):
     """Minimise ½‖U^½(y − Φx)‖² + t‖x‖₁ over x ≥ 0 while t falls to almost nothing.
 
     Non-negative least squares alone fills what the data do not see (the flux beyond the shortest baseline
@@ -40,6 +40,9 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last
     stopped : callable
         Asked after every iteration from the 10th on; True ends the fit with what there is: the brightest sources.
 
+    support : bool (nx, ny), optional
+        x = 0 elsewhere.
+
     Returns
     -------
     model : real (nx, ny)
@@ -60,6 +63,8 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last
         np.subtract(vis, residual, out=residual)
         residual *= precond
         measurement.adjoint(residual, gradient)
+        if support is not None:
+            gradient *= support  # from 0, without a gradient, no pixel leaves 0
         if first is None:
             first = FIRST_PENALTY * float(step) * float(max(gradient.max(), -gradient.min()))
         penalty = first * last_penalty ** min(iteration / (PATH * max_iter), 1.0) if last_penalty else 0

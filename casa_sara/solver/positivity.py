@@ -55,7 +55,7 @@ class Release:
         around = binary_dilation(both, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
         before = np.count_nonzero(ppd.lowest)
         lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
-        np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around)
+        np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around & (ppd.lowest < np.inf))
         return int(np.count_nonzero(ppd.lowest) - before)
 
     def state(self):
@@ -75,4 +75,4 @@ def _wanted(ppd, bounds):
     image[0, 0] = 1
     noise_sq = float(ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(image), image)[0, 0])
     gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)), image)
-    return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest)
+    return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest) & (ppd.lowest < np.inf)

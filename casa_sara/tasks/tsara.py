@@ -19,7 +19,7 @@ PARAMETERS = (
     Parameter('imsize', ('int', 'intVec'), [100], 'Number of pixels', minimum=1.0),
     Parameter('cell', ('int', 'double', 'intVec', 'doubleVec', 'string', 'stringVec'), [], 'Cell size', required=True),
     Parameter('phasecenter', ('int', 'string'), '', 'Phase center of the image'),
-    Parameter('stokes', ('string',), 'I', 'Stokes plane to make', allowed=('I',)),
+    Parameter('stokes', ('string',), 'I', 'Stokes plane to make', allowed=('I', 'Q', 'U', 'V')),
     Parameter('projection', ('string',), 'SIN', 'Coordinate projection', allowed=('SIN',)),
     Parameter('startmodel', ('string',), '', 'Name of starting model image'),
     Parameter('specmode', ('string',), 'mfs', 'Spectral definition mode (mfs, cube)', allowed=('mfs', 'cube')),
@@ -46,6 +46,9 @@ PARAMETERS = (
     Parameter('niter', ('int',), 100000, 'Maximum number of iterations; 0 makes dirty images only', minimum=0.0),
     Parameter('wavelets', ('stringVec',), ['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], 'Bases in which the sky is sparse together', allowed=('dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8')),
     Parameter('wavelevels', ('int',), 4, 'Levels of the wavelet transforms', minimum=1.0),
+    Parameter('usemask', ('string',), 'user', 'Type of mask(s) for deconvolution: user, or pb', allowed=('user', 'pb')),
+    Parameter('mask', ('string', 'stringVec'), '', 'Mask (a list of image name(s) or region file(s) or region string(s) )', opener='usemask', open_on=('user',)),
+    Parameter('pbmask', ('double',), 0.0, 'primary beam mask', minimum=0.0, maximum=1.0, opener='usemask', open_on=('user', 'pb')),
     Parameter('positivity', ('bool',), True, 'Keep the model from becoming negative'),
     Parameter('precondition', ('bool',), True, 'Use the sampling density to converge faster'),
     Parameter('databound', ('string',), 'adapt', 'How closely the model must fit each block of data', allowed=('adapt', 'weights', 'fixed')),
@@ -206,9 +209,11 @@ class _tsara:
         Examples: phasecenter='J2000 19h59m28.356 +40d44m02.10'
                   phasecenter=2
 
-    stokes : {'I'}, default 'I'
-        Only Stokes I, from RR and LL, from XX and YY, or from one of the two where only one was
-        recorded. As in tclean, a sample with any correlation flagged is not used.
+    stokes : {'I', 'Q', 'U', 'V'}, default 'I'
+        One of I, Q, U and V. I is formed from RR and LL, from XX and YY, or from one of the two where
+        only one was recorded; Q and U take RL and LR, V takes RR and LL; of linear feeds Q takes XX
+        and YY, U and V take XY and YX. Q, U and V may be negative: they need positivity=False.
+        As in tclean, a sample with any correlation flagged is not used.
 
     projection : {'SIN'}, default 'SIN'
         Only SIN: the projection in which an interferometer sees the sky.
@@ -376,6 +381,26 @@ class _tsara:
 
     wavelevels : int, default 4
         The coarsest wavelets are 2^wavelevels pixels apart.
+
+    usemask : {'user', 'pb'}, default 'user'
+        Where the model may be other than zero; outside it is exactly zero.
+          'user'  within mask, or everywhere without one
+          'pb'    where the primary beam is above pbmask, or above pblimit if that is more
+        What the sky holds outside stays in the residual, and raises the noise levels that are found:
+        a warning says so. A mask is written as imagename.mask.
+
+    mask : str or list of str, default ''
+        Opened by usemask = 'user'.
+        A region in CASA's text format (CRTF), a file of them, or an image of ones and zeros on any
+        grid; or a list of these, whose union counts. '' is no mask. An entry that selects nothing of
+        the image is refused.
+        Examples: mask='circle[[40pix,40pix],10pix]'
+                  mask='old.mask'
+                  mask=['regions.crtf', 'circle[[19h59m28.5s, 40d44m02s], 100arcsec]']
+
+    pbmask : float, default 0.0
+        Opened by usemask = 'user' or 'pb'.
+        The primary beam above which the mask reaches; with usemask='user' it cuts the mask off.
 
     positivity : bool, default True
         True for the brightness of the sky. Only beside an unresolved source that lies between pixels,
@@ -554,11 +579,11 @@ class _tsara:
         outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest', perchanweightdensity=True,
         gridder='standard', wprojplanes=-1, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[],
         restoration=True, restoringbeam=[], pbcor=False, niter=100000,
-        wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, positivity=True,
-        precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20,
-        l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003,
-        regscale=1.0, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False,
-        restart=False, overwrite=False, savemodel='none', parallel=False,
+        wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
+        mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
+        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
+        reltol=0.0003, finalreltol=0.0003, regscale=1.0, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='',
+        fullsummary=False, report=False, restart=False, overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())

@@ -1,0 +1,89 @@
+"""The support of the model: where the user, or the primary beam, lets it be other than zero, as tclean makes a mask."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from casa_sara.casa.imageplane import read_pixels
+from casa_sara.casa.images import write_image
+from casa_sara.casa.tools import opened, scratch_folder
+
+__all__ = ["read_support"]
+
+
+def read_support(grid, plane):
+    """Return the pixels that the model may use.
+
+    The mask is made by the code behind tclean, so regions, files and images on any grid mean what they mean there: the
+    union of all entries, within the primary beam above `pbmask`.
+
+    Parameters
+    ----------
+    grid : casa_sara.options.ImageGrid
+        Its `usemask`, `mask` and `pbmask`.
+    plane : ImagePlane
+
+    Returns
+    -------
+    bool (nx, ny), or None where there is no mask
+
+    Raises
+    ------
+    ValueError
+        An entry is no region and no image, or selects no pixel of this image; or nothing is left of the primary beam.
+    """
+    if grid.usemask == "pb":
+        support = plane.pb > grid.pbmask
+        if not support.any():
+            raise ValueError(f"usemask = 'pb', pbmask = {grid.pbmask:g}: the primary beam is nowhere in the image above it: "
+                             "should be less, or the image nearer to the pointing centre")
+        return support
+    if not grid.mask:
+        return None
+    support = np.zeros(plane.shape, bool)
+    for entry in grid.mask:
+        found = _mask_of(entry, plane) & ((plane.pb > grid.pbmask) | (grid.pbmask == 0))
+        if not found.any():
+            limits = f", pbmask = {grid.pbmask:g}" if grid.pbmask else ""
+            raise ValueError(f"mask = '{entry}'{limits} selects no pixel: should be a CRTF region as 'circle[[40pix,40pix],"
+                             "10pix]', a file of them that begins with #CRTF, or the name of an image of ones and zeros, with "
+                             f"something in it inside this image of {list(plane.shape)} pixels; '' is no mask")
+        support |= found
+    return support
+
+
+def _mask_of(entry, plane):
+    """Return the mask that tclean makes of one entry, bool (nx, ny): empty where it cannot read it."""
+    import casatools
+
+    deconvolver = casatools.synthesisdeconvolver()
+    with scratch_folder(plane.shape) as folder:
+        root = os.path.join(folder, "support")
+        _write_what_tclean_needs(root, plane)
+        wanted = os.path.abspath(entry) if os.path.exists(entry) else entry
+        try:
+            deconvolver.setupdeconvolution({
+                "imagename": root, "deconvolver": "hogbom", "specmode": "mfs", "startmodel": "", "restoringbeam": [],
+                "usemask": "user", "mask": wanted})
+            deconvolver.initminorcycle()
+            deconvolver.setupmask()
+        except (RuntimeError, UnicodeDecodeError) as error:
+            raise ValueError(f"mask = '{entry}': CASA makes no mask of this: "
+                             f"{' '.join(str(error).split())}") from error
+        finally:
+            deconvolver.done()
+        with opened("image", root + ".mask") as ia:
+            return read_pixels(ia) > 0
+
+
+def _write_what_tclean_needs(root, plane):
+    """Write the images that stand beside a mask: all empty, but for the primary beam and a point spread function."""
+    nx, ny = plane.shape
+    x, y = np.arange(nx)[:, None] - nx // 2, np.arange(ny)[None, :] - ny // 2
+    images = {".psf": np.exp(-(x**2 + y**2) / 8.0).astype(np.float32), ".pb": plane.pb}
+    for suffix in (".residual", ".model"):
+        images[suffix] = np.zeros(plane.shape, np.float32)
+    for suffix, pixels in images.items():
+        write_image(root + suffix, pixels, plane, masked=suffix == ".pb")
