@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
+from casa_sara.sharing import ALONE
 
 __all__ = ["Forecast", "Workload", "forecast"]
 
@@ -18,6 +19,7 @@ PLANNING = 64  # frequencies and factors, while the operator is built
 SOLVER = 52  # whitened data, density, preconditioner, dual, Φx̄, Φz, spread, weights
 PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
 WEIGHING = 30  # uv cells and densities
+CHECKPOINT = 20  # the dual, Φz and the spread
 # image planes, each 4 bytes a pixel
 PLANE = 1.25  # primary beam and mask
 NORM, NNLS, SOLVING, WRITING = 8, 4, 10, 10
@@ -39,12 +41,15 @@ class Workload:
     nthreads: int
     precondition: bool = True
     report: bool = False
+    whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
 
     @classmethod
-    def of(cls, census, grid, options, report=False):
-        """The workload of a census of the data and the task's parameters."""
-        return cls(census.samples, census.reach, grid.shape, grid.cell_rad, len(options.wavelets), options.wavelevels,
-                   options.niter, options.nthreads, options.precondition, report)
+    def of(cls, census, grid, options, report=False, crew=ALONE):
+        """The workload of a census of the data and the task's parameters, of this rank's share of them."""
+        writes, bases = crew.comm.rank == 0, len(options.wavelets)
+        return cls(math.ceil(census.samples * crew.share), census.reach, grid.shape, grid.cell_rad,
+                   len(crew.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
+                   options.precondition, report and writes, (census.samples, bases) if writes and crew.comm.size > 1 else (0, 0))
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -63,10 +68,16 @@ class Workload:
             phases["iterating"] = solver | {
                 "image planes": self._planes(PLANE + SOLVING), "re-weighting": PASSING * self.samples,
                 "wavelet duals and weights": 2 * coefs, "wavelet workspace": workspace}
+            if any(self.whole):
+                phases["writing a checkpoint"] = phases["iterating"] | {
+                    "gathered of all ranks": 2 * (CHECKPOINT * self.whole[0]
+                                                  + 2 * coefficient_bytes(self.shape, self.whole[1], self.levels)[0])}
         phases["writing"] = operator | {"while planning": PLANNING * self.samples,
                                         "image planes": self._planes(PLANE + WRITING)}
         if self.report:
-            phases["report"] = operator | {"drawing": REPORT + REPORT_SAMPLE * self.samples,
+            operator = replace(self, samples=max(self.samples, self.whole[0]), report=False).memory()["writing"]
+            del operator["while planning"]
+            phases["report"] = operator | {"drawing": REPORT + REPORT_SAMPLE * max(self.samples, self.whole[0]),
                                            "image planes": self._planes(REPORT_PLANES)}
         return phases
 
@@ -78,6 +89,8 @@ class Workload:
         return math.ceil(max(n * c for n, c in zip(self.shape, self.cell_rad)) / cell)
 
     def _grid(self):
+        if self.samples == 0:
+            return 0
         reach = [min(max(wave * cell, 1e-6), 0.5) for wave, cell in zip(self.reach, self.cell_rad)]
         return grid_bytes(self.samples, reach, self.shape)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -19,8 +20,9 @@ from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
 from casa_sara.deadline import Deadline
 from casa_sara.noise import noise_from_differences
-from casa_sara.operators.measurement import MeasurementOperator, check_cell, check_field
+from casa_sara.operators.measurement import MeasurementOperator, Summed, check_cell, check_field, share_of
 from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.parallel import SERIAL
 from casa_sara.reconstruction import Reconstruction, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import UNFINISHED
@@ -42,10 +44,12 @@ class Result:
     """What one run found, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
-    from the data, in units of what the weights say; `forecast` is what was said of memory and time before.
+    from the data, in units of what the weights say; `forecast` is what was said of memory and time before. Of several
+    ranks each has its own samples in `data`; `size` is the number of all.
     """
 
     data: Visibilities
+    size: int
     blocks: list[BlockInfo]
     noise: np.ndarray
     reconstruction: Reconstruction | None
@@ -60,7 +64,8 @@ class Result:
 
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-               output: Output, record: Callable[[Result], dict] | None = None, limits: Limits = Limits()) -> Result:
+               output: Output, record: Callable[[Result], dict] | None = None, limits: Limits = Limits(),
+               comm=SERIAL) -> Result:
     """Image a selection of MeasurementSets and write the products.
 
     Parameters
@@ -69,6 +74,9 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         What the task was asked for.
     record : callable, optional
         Returns what is kept beside the images of the result.
+    limits : Limits
+    comm : casa_sara.parallel.Serial or MPI
+        Ranks that share the work; rank 0 alone writes.
 
     Raises
     ------
@@ -77,52 +85,52 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     ValueError, FileNotFoundError, RuntimeError
         For data or parameters that no image can be made of; the message names the task parameter.
     """
-    deadline, forecast = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
-    forecast.require(limits.maxmem_gb)
+    deadline, (forecast, crew) = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits, comm)
+    comm.together(forecast.require, limits.maxmem_gb)
     checkpoint = checkpoint_of(selection, grid, options, output)
     if output.resume:
-        checkpoint.open()
+        comm.once(checkpoint.open)
     # read
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
-    data.notes.extend(_limits(data, grid))
-    plane = define_image_plane(data, selection, grid)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, crew)
+    data.notes.extend(_limits(data, grid, comm))
+    plane = comm.once(define_image_plane, data, selection, grid)
     if not plane.mask.any():
         data.notes.append(f"phasecenter = '{grid.phasecenter}': the image is outside the primary beam, and masked everywhere")
     for note in data.notes:
         log.warn(note)
-    start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
+    start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
     if output.images_stand:
-        _save_model(selection, data, grid, options, start)
-        return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)),
-                      forecast.summary())
+        comm.once(_save_model, selection, data, grid, options, start)
+        return Result(data, comm.total(data.size), [], np.zeros(0), None, comm.once(_peak, output.imagename + ".residual"),
+                      float(start.sum(dtype=float)), forecast.summary())
     # split and weigh
-    block_of_sample, blocks = snapshot_blocks(data, output.blocks)
-    data, offsets = sort_into_blocks(data, block_of_sample)
-    noise = noise_from_differences(data, offsets)
-    _describe(data, blocks, noise)
-    _point_spread(data, grid, weighting, options, plane)  # what cannot be weighed or restored is refused before the hours
+    block_of_sample, blocks = snapshot_blocks(data, output.blocks, comm)
+    data, offsets = sort_into_blocks(data, block_of_sample, len(blocks))
+    noise = noise_from_differences(data, offsets, comm)
+    _describe(data, blocks, noise, comm)
+    _point_spread(data, grid, weighting, options, plane, comm)  # what cannot be weighed or restored is refused before the hours
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
-        deadline.reserve = _after_iterations(data, grid, output, limits, deadline.elapsed())
+        deadline.reserve = _after_iterations(comm.total(data.size), grid, output, limits, deadline.elapsed())
         watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
-        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch)
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch, crew)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         model = reconstruction.model
-        data, blocks = without_wild(data, blocks, offsets, reconstruction)
+        data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
     # write
-    with waiting_child() as child:  # which starts meanwhile
-        weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
-        residual = dirty_image(operator, data.vis - operator.forward(model), weights)
+    with waiting_child() if comm.rank == 0 else nullcontext() as child:  # which starts meanwhile
+        weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
+        residual = dirty_image(operator, data.vis - operator.forward(model), weights, comm)
         images = dict(psf=psf, residual=residual, model=model)
-        result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()),
+        result = Result(data, comm.total(data.size), blocks, noise, reconstruction, float(np.abs(residual).max()),
                         float(model.sum(dtype=float)), forecast.summary())
-        write_products(output, plane, images, sum_of_weights(data, selection, weights), beam, record and record(result),
-                       child)
-    if result.finished or not checkpoint.stands:  # else one of an older run
-        checkpoint.remove()
+        sumwt = comm.total(sum_of_weights(data, selection, weights))
+        comm.once(write_products, output, plane, images, sumwt, beam, record and record(result), child)
+    if comm.broadcast(result.finished or not checkpoint.stands):  # else one of an older run
+        comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
-        _save_model(selection, data, grid, options, model)
+        comm.once(_save_model, selection, data, grid, options, model)
     return result
 
 
@@ -146,40 +154,43 @@ def _peak(name):
         return float(np.abs(read_pixels(ia)).max())
 
 
-def _point_spread(data, grid, weighting, options, plane):
+def _point_spread(data, grid, weighting, options, plane, comm):
     """Return the imaging weights, the operator of the dirty images, the PSF and the beam fitted to it."""
-    weights = imaging_weights(data, grid, weighting)
-    operator = MeasurementOperator(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads)
-    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
-    return weights, operator, psf, fit_beam(psf, plane)
+    weights = imaging_weights(data, grid, weighting, comm)
+    operator = Summed(share_of(data.uvw[:2], grid.cell_rad, grid.shape, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm),
+                      comm)
+    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
+    return weights, operator, psf, comm.once(fit_beam, psf, plane)
 
 
-def _limits(data, grid):
+def _limits(data, grid, comm):
     """What the user should know of this image plane and these baselines; raise where no image can be made of them."""
     notes = []
-    check_cell(data.uvw[:2], grid.cell_rad)
-    check_field(data.max_uv, grid.shape, grid.cell_rad)
+    reach = [[comm.largest(float(np.abs(axis).max(initial=0)))] for axis in data.uvw[:2]]
+    max_uv, max_w = comm.largest(data.max_uv), comm.largest(data.max_w)
+    check_cell(np.array(reach), grid.cell_rad)
+    check_field(max_uv, grid.shape, grid.cell_rad)
     arcsec = np.degrees(grid.cell_rad[0]) * 3600
-    pixels = 1 / (data.max_uv * max(grid.cell_rad))
+    pixels = 1 / (max_uv * max(grid.cell_rad))
     if pixels < FEWEST_PIXELS:
         notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below {FEWEST_PIXELS:g} "
                      f"sources between pixels cannot be represented; 5 would be cell = '{arcsec * pixels / 5:.3g}arcsec'")
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
-    phase = np.pi * data.max_w * corner_sq
+    phase = np.pi * max_w * corner_sq
     if phase > LARGEST_W_PHASE:
         notes.append(f"the w-term is not modelled: it turns phases by up to {phase:.2g} rad in the corners of this image")
     return notes
 
 
-def _after_iterations(data, grid, output, limits, read_s):
+def _after_iterations(samples, grid, output, limits, read_s):
     """Seconds to keep for what comes after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
-    return writing_seconds(data.size, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
+    return writing_seconds(samples, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
 
-def _describe(data, blocks, noise):
+def _describe(data, blocks, noise, comm):
     """Say in the log what was read."""
-    log.info(f"{data.size} Stokes I visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
+    log.info(f"{comm.total(data.size)} Stokes I visibilities, longest baseline {comm.largest(data.max_uv) / 1e3:.4g} klambda, "
              f"{len(blocks)} blocks")
     for reason, count in data.dropped.items():
         log.info(f"left out: {count} samples, {reason}")
