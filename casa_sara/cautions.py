@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.parallel import SERIAL
+
 __all__ = ["check_confined", "left_outside", "thermal_noise"]
 
 PEAK_OUTSIDE = 6.0  # standard deviations of the thermal noise
@@ -23,7 +25,7 @@ def check_confined(model, support):
     return support.astype(np.float32)
 
 
-def thermal_noise(data, weights, noise, blocks):
+def thermal_noise(data, weights, noise, offsets, comm=SERIAL):
     """Standard deviation of the thermal noise in the dirty image of some imaging weights W, in Jy/beam.
 
     √(Σ W²σ²)/Σ W, with σ_m = noise_j/√w_m of block j.
@@ -35,14 +37,18 @@ def thermal_noise(data, weights, noise, blocks):
     weights : real (M,)
     noise : float (d,)
         Of each block in units of what the weights say; where it is NaN the weights are taken at their word.
-    blocks : list of d BlockInfo
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
 
     Returns
     -------
     float
     """
-    level = np.repeat(np.where(np.isfinite(noise), noise, 1.0), [block.samples for block in blocks])
-    return float(np.sqrt(np.sum((weights * level) ** 2 / data.weight, dtype=float)) / weights.sum(dtype=float))
+    level = np.repeat(np.where(np.isfinite(noise), noise, 1.0), np.diff(offsets))
+    power = comm.total(float(np.sum((weights * level) ** 2 / data.weight, dtype=float)))
+    return float(np.sqrt(power) / comm.total(float(weights.sum(dtype=float))))
 
 
 def left_outside(residual, support, sigma):

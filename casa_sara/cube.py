@@ -87,7 +87,7 @@ class _Request:
 def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
               output: Output, record: Callable[[CubeResult], dict] | None = None, limits: Limits = Limits()) -> CubeResult:
     """Image a selection of MeasurementSets channel by channel and write the products; see :func:`casa_sara.imaging.make_image`."""
-    deadline, forecast = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
+    deadline, (forecast, _) = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
     forecast.require(limits.maxmem_gb)
     checkpoint = CubeCheckpoint(checkpoint_of(selection, grid, options, output))
     if output.resume:
@@ -226,5 +226,5 @@ class _Cube:
         for name, pixels in found.pixels.items():
             self.images[name][k] = pixels
         channel.sumwt, channel.beam = found.sumwt, found.beam
-        channel.result = Result(Tally(data.size, data.dropped), blocks, noise, reconstruction, found.residual_peak,
+        channel.result = Result(Tally(data.size, data.dropped), data.size, blocks, noise, reconstruction, found.residual_peak,
                                 found.model_flux, {})

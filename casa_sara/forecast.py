@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
 from casa_sara.operators.sky import further_bytes
+from casa_sara.sharing import ALONE
 
 __all__ = ["Forecast", "Workload", "forecast"]
 
@@ -21,6 +22,7 @@ SOLVER = 52  # whitened data, density, preconditioner, dual, Φx̄, Φz, spread,
 PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
 WEIGHING = 30  # uv cells and densities
 SORTING = 12  # of a cube: channels of the samples, and their order
+CHECKPOINT = 20  # the dual, Φz and the spread
 # image planes, each 4 bytes a pixel
 PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
 NORM, NNLS, SOLVING, WRITING = 8, 4, 10, 10
@@ -54,13 +56,16 @@ class Workload:
     channels: int = 0
     share: float = 1.0
     masked: bool = False
+    whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
 
     @classmethod
-    def of(cls, census, grid, options, report=False, band=0.0, channels=0, share=1.0):
-        """The workload of a census of the data and the task's parameters."""
-        return cls(census.samples, census.reach, grid.shape, grid.cell_rad, len(options.wavelets), options.wavelevels,
-                   options.niter, options.nthreads, options.precondition, report, grid.gridder, census.max_w,
-                   bool(grid.spectralindex), band, channels, share, grid.masked)
+    def of(cls, census, grid, options, report=False, band=0.0, channels=0, share=1.0, crew=ALONE):
+        """The workload of a census of the data and the task's parameters, of this rank's share of them."""
+        writes, bases = crew.comm.rank == 0, len(options.wavelets)
+        return cls(math.ceil(census.samples * crew.share), census.reach, grid.shape, grid.cell_rad,
+                   len(crew.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
+                   options.precondition, report and writes, grid.gridder, census.max_w, bool(grid.spectralindex), band, channels,
+                   share, grid.masked, (census.samples, bases) if writes and crew.comm.size > 1 else (0, 0))
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -96,12 +101,18 @@ class Workload:
             phases["iterating"] = solver | {
                 "image planes": self._planes(PLANE + SOLVING), "re-weighting": PASSING * self.samples,
                 "wavelet duals and weights": 2 * coefs, "wavelet workspace": workspace}
+            if any(self.whole):
+                phases["writing a checkpoint"] = phases["iterating"] | {
+                    "gathered of all ranks": 2 * (CHECKPOINT * self.whole[0]
+                                                  + 2 * coefficient_bytes(self.shape, self.whole[1], self.levels)[0])}
         phases["writing"] = operator | {"while planning": PLANNING * self.samples,
                                         "image planes": self._planes(PLANE + WRITING)}
         if self.frequencies:
             phases["writing"]["operator of flat spectra"] = plain + further_bytes(self.samples, self, self.max_w)
         if self.report:
-            phases["report"] = operator | {"drawing": REPORT + REPORT_SAMPLE * self.samples,
+            operator = replace(self, samples=max(self.samples, self.whole[0]), report=False).memory()["writing"]
+            del operator["while planning"]
+            phases["report"] = operator | {"drawing": REPORT + REPORT_SAMPLE * max(self.samples, self.whole[0]),
                                            "image planes": self._planes(REPORT_PLANES)}
         return phases
 
@@ -113,6 +124,8 @@ class Workload:
         return math.ceil(max(n * c for n, c in zip(self.shape, self.cell_rad)) / cell)
 
     def _grid(self):
+        if self.samples == 0:
+            return 0
         reach = [min(max(wave * cell, 1e-6), 0.5) for wave, cell in zip(self.reach, self.cell_rad)]
         return grid_bytes(self.samples, reach, self.shape)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -22,10 +23,11 @@ from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
 from casa_sara.cautions import check_confined, left_outside, thermal_noise
 from casa_sara.deadline import Deadline
 from casa_sara.noise import noise_from_differences
-from casa_sara.operators.measurement import check_cell, check_field
+from casa_sara.operators.measurement import Summed, check_cell, check_field
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Spectrum, Weighting
+from casa_sara.parallel import SERIAL
 from casa_sara.reconstruction import Reconstruction, operator_accuracy, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import UNFINISHED
@@ -49,10 +51,12 @@ class Result:
     """What one run found, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
-    from the data, in units of what the weights say; `forecast` is what was said of memory and time before.
+    from the data, in units of what the weights say; `forecast` is what was said of memory and time before. Of several
+    ranks each has its own samples in `data`; `size` is the number of all.
     """
 
     data: Visibilities
+    size: int
     blocks: list[BlockInfo]
     noise: np.ndarray
     reconstruction: Reconstruction | None
@@ -97,7 +101,8 @@ class PlaneImages:
 
 
 def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-               output: Output, record: Callable[[Result], dict] | None = None, limits: Limits = Limits()) -> Result:
+               output: Output, record: Callable[[Result], dict] | None = None, limits: Limits = Limits(),
+               comm=SERIAL) -> Result:
     """Image a selection of MeasurementSets and write the products.
 
     Parameters
@@ -106,6 +111,9 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         What the task was asked for.
     record : callable, optional
         Returns what is kept beside the images of the result.
+    limits : Limits
+    comm : casa_sara.parallel.Serial or MPI
+        Ranks that share the work; rank 0 alone writes.
 
     Raises
     ------
@@ -114,77 +122,79 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     ValueError, FileNotFoundError, RuntimeError
         For data or parameters that no image can be made of; the message names the task parameter.
     """
-    deadline, forecast = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
-    forecast.require(limits.maxmem_gb)
+    deadline, (forecast, crew) = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits, comm)
+    comm.together(forecast.require, limits.maxmem_gb)
     checkpoint = checkpoint_of(selection, grid, options, output)
     if output.resume:
-        checkpoint.open()
+        comm.once(checkpoint.open)
     # read
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
-    data.notes.extend(image_limits(data, grid))
-    plane = define_image_plane(data, selection, grid, output.pblimit)
-    grid = with_spectrum(grid, plane)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), crew)
+    data.notes.extend(image_limits(data, grid, comm))
+    plane = comm.once(define_image_plane, data, selection, grid, output.pblimit)
+    grid = comm.once(with_spectrum, grid, plane)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
     _caution(data)
-    start = read_model(output.startmodel, plane) if output.startmodel and not output.resume else None
+    start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
     if output.images_stand:
-        _save_model(selection, data, grid, options, start)
-        return Result(data, [], np.zeros(0), None, _peak(output.imagename + ".residual"), float(start.sum(dtype=float)),
-                      forecast.summary())
-    support = read_support(grid, plane)
+        comm.once(_save_model, selection, data, grid, options, start)
+        return Result(data, comm.total(data.size), [], np.zeros(0), None, comm.once(_peak, output.imagename + ".residual"),
+                      float(start.sum(dtype=float)), forecast.summary())
+    support = comm.once(read_support, grid, plane)
     if support is not None and start is not None:
         start *= support
     # split and weigh
-    part = split(data, output.blocks)
+    part = split(data, output.blocks, comm)
     data, blocks, offsets, noise = part.data, part.blocks, part.offsets, part.noise
-    describe(data, blocks, noise, grid.stokes)
+    describe(data, blocks, noise, grid.stokes, comm)
     if grid.gridder == "wproject":
-        log.info(WTerm.of(data.max_w, grid.shape, grid.cell_rad, operator_accuracy(data, offsets, noise)).words)
-    _point_spread(data, grid, weighting, options, plane)  # what cannot be weighed or restored is refused before the hours
+        accuracy = operator_accuracy(data, offsets, noise, comm)
+        log.info(WTerm.of(comm.largest(data.max_w), grid.shape, grid.cell_rad, accuracy).words)
+    _point_spread(data, grid, weighting, options, plane, comm)  # what cannot be weighed or restored is refused before the hours
     # solve
     reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
     if options.niter > 0:
-        deadline.reserve = _after_iterations(data, grid, output, limits, deadline.elapsed())
+        deadline.reserve = _after_iterations(comm.total(data.size), grid, output, limits, deadline.elapsed())
         watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
-        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch,
-                                     support)
+        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch, support, crew)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         model = reconstruction.model
-        data, blocks = without_wild(data, blocks, offsets, reconstruction)
+        data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
+        offsets = np.searchsorted(reconstruction.kept, offsets)
     # write
-    with waiting_child() as child:  # which starts meanwhile
-        images = plane_images(data, model, selection, grid, weighting, options, plane)
+    with waiting_child() if comm.rank == 0 else nullcontext() as child:  # which starts meanwhile
+        images = plane_images(data, model, selection, grid, weighting, options, plane, comm)
         if support is not None:
             images.pixels["mask"] = check_confined(model, support)
-            sigma = thermal_noise(data, images.weights, noise, blocks)
+            sigma = thermal_noise(data, images.weights, noise, offsets, comm)
             _caution(data, left_outside(images.pixels["residual"], support, sigma))
-        result = Result(data, blocks, noise, reconstruction, images.residual_peak, images.model_flux, forecast.summary())
-        write_products(output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
-    if result.finished or not checkpoint.stands:  # else one of an older run
-        checkpoint.remove()
+        result = Result(data, comm.total(data.size), blocks, noise, reconstruction, images.residual_peak, images.model_flux,
+                        forecast.summary())
+        comm.once(write_products, output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
+    if comm.broadcast(result.finished or not checkpoint.stands):  # else one of an older run
+        comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
-        _save_model(selection, data, grid, options, model)
+        comm.once(_save_model, selection, data, grid, options, model)
     return result
 
 
-def split(data, blocks):
+def split(data, blocks, comm=SERIAL):
     """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`)."""
-    block_of_sample, infos = snapshot_blocks(data, blocks)
-    data, offsets = sort_into_blocks(data, block_of_sample)
-    noise = noise_from_differences(data, offsets)
+    block_of_sample, infos = snapshot_blocks(data, blocks, comm)
+    data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
+    noise = noise_from_differences(data, offsets, comm)
     return Split(data, infos, offsets, noise)
 
 
-def plane_images(data, model, selection, grid, weighting, options, plane):
+def plane_images(data, model, selection, grid, weighting, options, plane, comm=SERIAL):
     """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of."""
-    weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
-    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model), weights)
+    weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
+    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the hands, too
         sumwt = float(weights.sum(dtype=float))
     else:
         sumwt = sum_of_weights(data, selection, weights, grid.stokes)
-    return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, sumwt, beam)
+    return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, comm.total(sumwt), beam)
 
 
 def _caution(data, notes=None):
@@ -216,43 +226,45 @@ def _peak(name):
         return float(np.abs(read_pixels(ia)).max())
 
 
-def _predicted(operator, data, grid, options, model):
+def _predicted(operator, data, grid, options, model, comm):
     """Return the visibilities of a model, by the operator of the dirty images unless there is a spectrum."""
     if grid.spectrum is not None:
-        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads)
+        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm)
     return operator.forward(model)
 
 
-def _point_spread(data, grid, weighting, options, plane):
+def _point_spread(data, grid, weighting, options, plane, comm):
     """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and the beam fitted to it."""
-    weights = imaging_weights(data, grid, weighting)
-    operator = sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads)
-    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights)
-    return weights, operator, psf, fit_beam(psf, plane)
+    weights = imaging_weights(data, grid, weighting, comm)
+    operator = Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm), comm)
+    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
+    return weights, operator, psf, comm.once(fit_beam, psf, plane)
 
 
-def image_limits(data, grid):
+def image_limits(data, grid, comm=SERIAL):
     """What the user should know of this image plane and these baselines; raise where no image can be made of them."""
     notes = []
-    check_cell(data.uvw[:2], grid.cell_rad)
-    check_field(data.max_uv, grid.shape, grid.cell_rad)
+    reach = [[comm.largest(float(np.abs(axis).max(initial=0)))] for axis in data.uvw[:2]]
+    max_uv, max_w = comm.largest(data.max_uv), comm.largest(data.max_w)
+    check_cell(np.array(reach), grid.cell_rad)
+    check_field(max_uv, grid.shape, grid.cell_rad)
     arcsec = np.degrees(grid.cell_rad[0]) * 3600
-    pixels = 1 / (data.max_uv * max(grid.cell_rad))
+    pixels = 1 / (max_uv * max(grid.cell_rad))
     if pixels < FEWEST_PIXELS:
         notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below {FEWEST_PIXELS:g} "
                      f"sources between pixels cannot be represented; 5 would be cell = '{arcsec * pixels / 5:.3g}arcsec'")
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
-    phase = np.pi * data.max_w * corner_sq
+    phase = np.pi * max_w * corner_sq
     if phase > LARGEST_W_PHASE and grid.gridder == "standard":
         notes.append(f"the w-term is not modelled: it turns phases by up to {phase:.2g} rad in the corners of this image; "
                      "gridder = 'wproject' models it")
     return notes
 
 
-def _after_iterations(data, grid, output, limits, read_s):
+def _after_iterations(samples, grid, output, limits, read_s):
     """Seconds to keep for what comes after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
-    return writing_seconds(data.size, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
+    return writing_seconds(samples, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
 
 def nowhere_visible(grid, output):
@@ -261,9 +273,10 @@ def nowhere_visible(grid, output):
             f"{output.pblimit:g}, and its pixels are masked everywhere")
 
 
-def describe(data, blocks, noise, stokes):
+def describe(data, blocks, noise, stokes, comm=SERIAL):
     """Say in the log what was read."""
-    log.info(f"{data.size} Stokes {stokes} visibilities, longest baseline {data.max_uv / 1e3:.4g} klambda, "
+    log.info(f"{comm.total(data.size)} Stokes {stokes} visibilities, longest baseline "
+             f"{comm.largest(data.max_uv) / 1e3:.4g} klambda, "
              f"{len(blocks)} blocks")
     for reason, count in data.dropped.items():
         log.info(f"left out: {count} samples, {reason}")

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.parallel import SERIAL
+from casa_sara.sharing import by_baseline
+
 __all__ = ["MEDIAN_TO_SIGMA", "noise_from_differences", "series_of_rows"]
 
 FEWEST_DIFFERENCES = 20
 MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
 
 
-def noise_from_differences(visibilities, offsets):
+def noise_from_differences(visibilities, offsets, comm=SERIAL):
     """Measure the noise of each block in units of what its weights predict.
 
     Along one baseline and channel the sky changes slowly and the noise does not, so
@@ -28,6 +31,8 @@ def noise_from_differences(visibilities, offsets):
         In the order of their blocks.
     offsets : int (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1].
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread: each is sent all of some baselines for this.
 
     Returns
     -------
@@ -35,39 +40,40 @@ def noise_from_differences(visibilities, offsets):
         Standard deviation of Re V·√w and of Im V·√w: 1 where the weights are right, 2 where the
         noise is twice what they say. NaN where fewer than 20 differences can be formed.
     """
+    visibilities, offsets = by_baseline(visibilities, offsets, comm)
     series = series_of_rows(visibilities.rows)
-    return np.array([_block_noise(visibilities, slice(*ends), series) for ends in zip(offsets[:-1], offsets[1:])])
+    return np.array([_block_noise(visibilities, slice(*ends), series, comm) for ends in zip(offsets[:-1], offsets[1:])])
 
 
 def series_of_rows(rows):
     """Number the distinct (MeasurementSet, observation, field, spw, baseline) and return each row's."""
     key = np.zeros(rows.time.size, dtype=np.int64)
     for column in (rows.ms, rows.observation, rows.field, rows.spw, rows.antenna1, rows.antenna2):
-        key = np.unique(key * (int(column.max()) + 1) + column, return_inverse=True)[1]
+        key = np.unique(key * (int(column.max(initial=0)) + 1) + column, return_inverse=True)[1]
     return key
 
 
-def _block_noise(visibilities, block, series):
+def _block_noise(visibilities, block, series, comm):
     """Return the noise of one block, or NaN."""
     row, chan = visibilities.row[block], visibilities.chan[block]
-    key = series[row] * (int(chan.max()) + 1) + chan
+    key = series[row] * (int(chan.max(initial=0)) + 1) + chan
     time = visibilities.rows.time[row]
     order = np.lexsort((time, key))
     vis = visibilities.vis[block][order].astype(complex)
     variance = 1.0 / visibilities.weight[block][order].astype(float)
     step = np.diff(time[order])
     same = (np.diff(key[order]) == 0) & (step > 0)
-    if not same.any():
+    if not comm.total(np.count_nonzero(same)):
         return np.nan
-    next_one = same & (step < 1.5 * np.median(step[same]))
+    next_one = same & (step < 1.5 * comm.median(step[same]))
     middle = next_one[:-1] & next_one[1:]
-    if np.count_nonzero(middle) >= FEWEST_DIFFERENCES:
+    if comm.total(np.count_nonzero(middle)) >= FEWEST_DIFFERENCES:
         difference = (vis[:-2] - 2 * vis[1:-1] + vis[2:])[middle]
         variance = (variance[:-2] + 4 * variance[1:-1] + variance[2:])[middle]
-    elif np.count_nonzero(next_one) >= FEWEST_DIFFERENCES:
+    elif comm.total(np.count_nonzero(next_one)) >= FEWEST_DIFFERENCES:
         difference = np.diff(vis)[next_one]
         variance = (variance[:-1] + variance[1:])[next_one]
     else:
         return np.nan
     whitened = difference / np.sqrt(variance)
-    return float(MEDIAN_TO_SIGMA * np.median(np.abs([whitened.real, whitened.imag])))
+    return float(MEDIAN_TO_SIGMA * comm.median(np.abs([whitened.real, whitened.imag])))

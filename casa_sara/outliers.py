@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from casa_sara.noise import MEDIAN_TO_SIGMA, series_of_rows
+from casa_sara.parallel import SERIAL
+from casa_sara.sharing import series_with
 
 __all__ = ["WildSamples", "find_wild"]
 
@@ -44,7 +46,7 @@ class WildSamples:
         ]
 
 
-def find_wild(data, offsets, residual, flux_jy):
+def find_wild(data, offsets, residual, flux_jy, comm=SERIAL):
     """Find samples that a first image cannot have left for any reason but their own.
 
     A sample is wild when its residual exceeds 20 times the scale of its block (1.4826 × the median of the whitened real and
@@ -67,6 +69,8 @@ def find_wild(data, offsets, residual, flux_jy):
         y − Φx of the image, whitened by √weight.
     flux_jy : float
         Σ|x| of the image.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread; each finds those of its own.
 
     Returns
     -------
@@ -76,14 +80,14 @@ def find_wild(data, offsets, residual, flux_jy):
     scale = np.empty_like(size)
     for start, stop in zip(offsets[:-1], offsets[1:]):
         block = residual[start:stop]
-        scale[start:stop] = MEDIAN_TO_SIGMA * np.median(np.abs([block.real, block.imag]))
+        scale[start:stop] = MEDIAN_TO_SIGMA * comm.median(np.abs([block.real, block.imag]))
     predicted = np.abs(data.vis - residual / np.sqrt(data.weight))
     suspect = np.flatnonzero((size > SIGNIFICANT * scale) & (size > predicted * np.sqrt(data.weight)))
     impossible = np.abs(data.vis[suspect]) > IMPOSSIBLE * flux_jy
-    wild = suspect[impossible | _alone(data, residual, suspect)]
-    if wild.size > MOST * data.size:
+    wild = suspect[impossible | _alone(*series_with(data, residual, suspect, comm))]
+    if comm.total(wild.size) > MOST * comm.total(data.size):
         wild = wild[:0]
-    wild = wild[size[wild] >= COMPARABLE * size[wild].max(initial=0)]
+    wild = wild[size[wild] >= COMPARABLE * comm.largest(size[wild].max(initial=0))]
     return WildSamples(wild, np.abs(data.vis[wild]), predicted[wild])
 
 

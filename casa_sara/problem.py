@@ -6,10 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.operators.measurement import MeasurementOperator, Summed
 from casa_sara.operators.norms import power_method
 from casa_sara.operators.sky import sky_operator
 from casa_sara.outliers import find_wild
+from casa_sara.parallel import SERIAL
+from casa_sara.sharing import Layout
 from casa_sara.solver.nnls import nnls
 from casa_sara.visibilities import Visibilities
 
@@ -52,7 +54,10 @@ class Findings:
 
 @dataclass
 class Problem:
-    """Whitened samples y = √w·V, the operators that belong to them, and the pixels that may be other than zero (None: all)."""
+    """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be other than zero.
+
+    `support` is None where all may.
+    """
 
     samples: Samples
     vis: np.ndarray
@@ -63,22 +68,23 @@ class Problem:
     support: np.ndarray | None = None
 
     @classmethod
-    def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None, support=None):
+    def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None, support=None, comm=SERIAL):
         """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`; measure its norm unless given."""
         data = samples.data
         sqrt_weight = np.sqrt(data.weight)
         vis = data.vis * sqrt_weight
         sqrt_weight *= np.float32(unit_jy)
         measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=sqrt_weight, eps=eps,
-                                   nthreads=options.nthreads)
-        precond = _preconditioner(samples.density, options.precondition)
+                                   nthreads=options.nthreads, comm=comm)
+        precond = _preconditioner(samples.density, options.precondition, comm)
         if data_norm_sq is None:
-            data_norm_sq = power_method(lambda image: measurement.adjoint(precond * measurement.forward(image)),
-                                        grid.shape, dtype=np.float32)
+            whole = Summed(measurement, comm)
+            data_norm_sq = comm.broadcast(power_method(
+                lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32))
         return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support)
 
 
-def first_image(samples, problem_of, options, stopped=lambda: False):
+def first_image(samples, problem_of, options, stopped=lambda: False, comm=SERIAL):
     """Find the image of positivity and a vanishing sparsity alone, where the bounds start, and the model too.
 
     Parameters
@@ -89,6 +95,8 @@ def first_image(samples, problem_of, options, stopped=lambda: False):
     options : SolverOptions
     stopped : callable
         Ends the fit early when it returns True.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
 
     Returns
     -------
@@ -98,27 +106,30 @@ def first_image(samples, problem_of, options, stopped=lambda: False):
     first : real (nx, ny)
         In `problem.unit_jy`.
     """
-    everything, wild = samples.data.size, []
+    everything, wild, layout = samples.data.size, [], Layout(samples.offsets, comm)
     for _ in range(ROUNDS):
         problem = problem_of(samples)
-        first, residual = nnls(problem.measurement, problem.vis, problem.precond, problem.data_norm_sq,
+        first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                                positivity=options.positivity, stopped=stopped, support=problem.support)
         found = find_wild(samples.data, samples.offsets, residual,
-                          problem.unit_jy * float(np.abs(first).sum(dtype=float)))
-        if found.index.size == 0:
+                          problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
+        count = comm.total(found.index.size)
+        if count == 0:
             break
-        wild += found.named(samples.data)
+        named = zip(layout.numbers(samples.kept[found.index]).tolist(), found.named(samples.data))
+        wild += [words for _, words in sorted(sum(comm.gather(list(named)), []), key=lambda one: one[0])]
         samples = samples.without(found.index)
-    if found.index.size:
+    if count:
         problem, residual = problem_of(samples), np.delete(residual, found.index)
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
-    nnls_norms = np.array([np.linalg.norm(residual[a:b]) for a, b in zip(samples.offsets[:-1], samples.offsets[1:])])
+    nnls_norms = comm.norms(np.array([np.linalg.norm(residual[a:b])
+                                      for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]))
     return problem, Findings(left_out, wild, nnls_norms, problem.data_norm_sq), first
 
 
-def _preconditioner(density, wanted):
+def _preconditioner(density, wanted, comm):
     """U = 1/density, largest value 1."""
     if not wanted:
         return np.ones(density.size, np.float32)
     precond = 1.0 / np.asarray(density, float)
-    return (precond / precond.max()).astype(np.float32)
+    return (precond / comm.largest(precond.max(initial=0))).astype(np.float32)

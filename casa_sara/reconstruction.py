@@ -9,11 +9,14 @@ import numpy as np
 
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
+from casa_sara.parallel import SERIAL
 from casa_sara.problem import Findings, Problem, Samples, first_image
-from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.sharing import ALONE, Layout
+from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, solve
+from casa_sara.solver.statefile import digest
 
 __all__ = ["Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
 
@@ -61,7 +64,7 @@ class Reconstruction:
 
 
 def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=None,
-                progress=lambda ppd, record: None, stopped=lambda: False, checkpoint=None, support=None):
+                progress=lambda ppd, record: None, stopped=lambda: False, checkpoint=None, support=None, crew=ALONE):
     """Find the SARA image of block-sorted visibilities.
 
     Parameters
@@ -82,9 +85,11 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
         See :func:`casa_sara.solver.reweighting.solve`; `stopped` ends the NNLS fit too, and one iteration follows.
     checkpoint : Checkpoint, optional
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
-        whose NNLS fit was cut short is not kept: it is not on the way to the same image.
+        whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
     support : bool (nx, ny), optional
         The model is exactly 0 elsewhere.
+    crew : Crew
+        The ranks that share the work: `data`, `offsets` and `density` are this rank's part, all else is the same on all.
 
     Returns
     -------
@@ -95,26 +100,33 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     CheckpointError
         The state that was read is not one of these data.
     """
+    comm = crew.comm
     check_l2bound(options, len(offsets) - 1)
     samples = Samples(data, np.asarray(offsets), density, np.arange(data.size))
     # images in units of the noise of one sample: every number is near 1
-    unit_jy = float(np.mean(data.weight, dtype=float) ** -0.5)
-    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support,
-                         eps=operator_accuracy(data, offsets, noise))
+    unit_jy = float(comm.mean(data.weight, dtype=float) ** -0.5)
+    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support, comm=comm,
+                         eps=operator_accuracy(data, offsets, noise, comm))
+    layout = Layout(samples.offsets, comm)
     if checkpoint is not None:
-        checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, blocks=samples.offsets,
-                            density=density, noise=noise, support=support,
-                            spectralindex=grid.spectrum and np.asarray(grid.spectrum.index))
-    if checkpoint is not None and checkpoint.state is not None:
-        solution = _resume(samples, problem_of, options, noise, checkpoint)
+        gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=density)
+        digests = {name: digest(whole) for name, array in gathered.items()
+                   if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
+        spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
+        digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
+            blocks=layout.offsets, noise=noise, support=support, spectralindex=spectralindex).items()}
+        comm.once(checkpoint.identify, **digests)
+    if checkpoint is not None and comm.broadcast(checkpoint.state is not None):
+        solution = _resume(samples, layout, problem_of, options, noise, checkpoint, crew)
     else:
-        solution = _begin(samples, problem_of, options, noise, startmodel, stopped)
+        solution = _begin(samples, problem_of, options, noise, startmodel, stopped, crew)
         if stopped():
             checkpoint = None
 
     def keep(stage, now):
-        if checkpoint is not None:
-            checkpoint.keep(lambda: solution.state(stage), solution.ppd.iteration, now)
+        if checkpoint is not None and comm.broadcast(checkpoint.due(now)):
+            state = solution.state(stage, layout, crew)
+            comm.once(checkpoint.keep, lambda: state, solution.ppd.iteration, now=True)
 
     found, ppd, bounds = solution.found, solution.ppd, solution.bounds
     schedule = schedule_of(options)
@@ -123,9 +135,10 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     record = solve(ppd, bounds, schedule, progress, stopped, keep, solution.stage)
     if record.stop_code == CONVERGED and found.noise_only:
         record.stop_code = NOISE_ONLY
-    ppd.model *= np.float32(unit_jy)
+    model = comm.own(ppd.model)
+    model *= np.float32(unit_jy)
     noise_jy_per_beam = unit_jy * bounds.total_weight**-0.5
-    return Reconstruction(ppd.model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
+    return Reconstruction(model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
                           found.data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam,
                           np.delete(samples.kept, found.left_out), found.wild)
 
@@ -140,27 +153,33 @@ class _Solution:
     stage: Stage | None = None
 
     @classmethod
-    def of(cls, problem, found, options, noise):
+    def of(cls, problem, found, options, noise, crew):
         """Put it together, at the very beginning."""
         measurement, unit_jy = problem.measurement, problem.unit_jy
-        dictionary = SaraDictionary(measurement.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
+        dictionary = SaraDictionary(measurement.shape, crew.wavelets(options.wavelets), options.wavelevels,
+                                    nthreads=options.nthreads, n_bases=len(options.wavelets))
         ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.samples.offsets, problem.precond,
-                          found.data_norm_sq, options.positivity)
+                          found.data_norm_sq, options.positivity, comm=crew.comm)
         ppd.unit_jy = unit_jy
         if problem.support is not None:
             ppd.confine(problem.support)
         weights = problem.samples.data.weight * np.float32(unit_jy**2)
         return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, noise, options))
 
-    def state(self, stage):
-        """Return all that :func:`_resume` needs beside the data and the parameters."""
-        return dict(found=vars(self.found), ppd=self.ppd.state(), bounds=self.bounds.state(), stage=stage.state())
+    def state(self, stage, layout, crew):
+        """Return, on rank 0, all that :func:`_resume` needs beside the data and the parameters, as one rank alone has it."""
+        left_out = np.concatenate(crew.comm.gather(layout.numbers(self.found.left_out)))
+        found = vars(self.found) | dict(left_out=np.sort(left_out))
+        ppd, kept = self.ppd.state(), Layout(self.ppd.offsets, crew.comm)
+        ppd |= {name: kept.gather(ppd[name]) for name in SAMPLE_ARRAYS}
+        ppd |= {name: crew.gather_bases(ppd[name]) for name in BASIS_ARRAYS}
+        return dict(found=found, ppd=ppd, bounds=self.bounds.state(), stage=stage.state())
 
 
-def _begin(samples, problem_of, options, noise, startmodel, stopped):
+def _begin(samples, problem_of, options, noise, startmodel, stopped, crew):
     """Leave out wild samples, and begin from the first image or from `startmodel`."""
-    problem, found, first = first_image(samples, problem_of, options, stopped)
-    solution = _Solution.of(problem, found, options, noise)
+    problem, found, first = first_image(samples, problem_of, options, stopped, crew.comm)
+    solution = _Solution.of(problem, found, options, noise, crew)
     found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
     if startmodel is not None:
         first = startmodel / np.float32(problem.unit_jy)
@@ -171,14 +190,19 @@ def _begin(samples, problem_of, options, noise, startmodel, stopped):
     return solution
 
 
-def _resume(samples, problem_of, options, noise, checkpoint):
-    """Go on from the state that was read."""
-    with checkpoint.applied() as state:
+def _resume(samples, layout, problem_of, options, noise, checkpoint, crew):
+    """Go on from the state that rank 0 has read."""
+    with checkpoint.applied(crew.comm.rank == 0) as state:
+        state = _plain_state(state, crew.comm)
         found = Findings(**{name: np.array(value) if isinstance(value, np.ndarray) else value
                             for name, value in state["found"].items()})
+        found.left_out = layout.here(found.left_out)
         problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq)
-        solution = _Solution.of(problem, found, options, noise)
-        solution.ppd.set_state(state["ppd"])
+        solution = _Solution.of(problem, found, options, noise, crew)
+        ppd, kept = state["ppd"], Layout(solution.ppd.offsets, crew.comm)
+        ppd |= {name: kept.scatter(ppd[name]) for name in SAMPLE_ARRAYS}
+        ppd |= {name: crew.scatter_bases(ppd[name]) for name in BASIS_ARRAYS}
+        solution.ppd.set_state(ppd)
         solution.bounds.set_state(state["bounds"])
         solution.stage = Stage.of(state["stage"])
     return solution
@@ -191,12 +215,21 @@ def check_l2bound(options, blocks):
                          "for all of them, or one for each")
 
 
-def operator_accuracy(data, offsets, noise):
+def _plain_state(state, comm):
+    """Return the state with all that every rank needs whole; what is spread over them stays on rank 0."""
+    if comm.size == 1:
+        return state
+    spread = {name: state["ppd"].pop(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)} if comm.rank == 0 else {}
+    state = comm.broadcast(state)
+    return state | dict(ppd=state["ppd"] | {name: spread.get(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)})
+
+
+def operator_accuracy(data, offsets, noise, comm=SERIAL):
     """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown."""
     if noise is None or not np.all(np.asarray(noise) > 0):
         return SMALLEST_EPS[np.dtype(np.float32)]
     level = np.repeat(np.asarray(noise, np.float32), np.diff(offsets))
-    return choose_eps(data.vis, data.weight / level**2)
+    return choose_eps(data.vis, data.weight / level**2, comm=comm)
 
 
 def schedule_of(options):
@@ -206,8 +239,8 @@ def schedule_of(options):
 
 
 def _bounds(ppd, nnls_norms, weights, noise, options):
-    samples = np.diff(ppd.offsets)
-    weight_sums = np.add.reduceat(weights, ppd.offsets[:-1], dtype=float)
+    samples = ppd.block_sizes
+    weight_sums = ppd.comm.block_sums(weights, ppd.offsets)
     common = dict(samples=samples, weight_sums=weight_sums, n_bases=ppd.dictionary.n_bases, regscale=options.regscale)
     if options.databound == "weights":
         return GivenBounds(chi_square_bounds(samples), **common)
@@ -226,7 +259,7 @@ def _bounds(ppd, nnls_norms, weights, noise, options):
 def _is_noise_only(ppd, bounds):
     """Whether the naturally weighted dirty image holds no peak above 5 times its noise."""
     whitening = np.repeat(bounds.noise_weights.astype(np.float32), np.diff(ppd.offsets))
-    dirty = ppd.measurement.adjoint(ppd.vis * whitening)
+    dirty = ppd.adjoint(ppd.vis * whitening)
     return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(bounds.total_weight))
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from casa_sara.balance import muster
 from casa_sara.casa import log
 from casa_sara.casa.census import take_census
 from casa_sara.casa.imageplane import define_image_plane
@@ -18,35 +19,42 @@ from casa_sara.casa.spectrum import spectral_band, with_spectrum
 from casa_sara.forecast import Workload, forecast
 from casa_sara.operators.measurement import check_field
 from casa_sara.resources import available_memory, resident_memory
+from casa_sara.parallel import SERIAL
 from casa_sara.timing import measure
 from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
 
 __all__ = ["foresee", "rehearse"]
 
 
-def foresee(selection, grid, options, limits):
-    """Forecast the memory of a run, from the numbers of rows, channels and pixels, and say it in the log.
+def foresee(selection, grid, options, limits, comm=SERIAL):
+    """Share the work of a run among the ranks, and forecast the memory of this one, from the numbers of rows, channels and pixels.
 
-    Flags are read only where the run would not fit with all samples.
+    Rank 0 says its own in the log. Flags are read only where the run would not fit with all samples.
 
     Returns
     -------
     casa_sara.forecast.Forecast
+    casa_sara.sharing.Crew
     """
-    resident, available = resident_memory(), available_memory()
+    resident, available = resident_memory(), available_memory() // comm.node_size
     channels, share = _channels(selection, grid)
     for flags in (False, True):
-        census = take_census(selection, flags, grid.stokes)
+        census = comm.once(take_census, selection, flags, grid.stokes)
         if any(census.reach):  # else there is nothing to read, which reading explains
             check_field(math.hypot(*census.reach), grid.shape, grid.cell_rad)
         band = spectral_band(grid, census.freq_range_hz)
-        work = Workload.of(census, grid, options, limits.report, band, channels, share)
-        found = forecast(work, resident, available, limits.maxmem_gb)
-        if found.fits:
+
+        def memory_of(crew, census=census, band=band):
+            work = Workload.of(census, grid, options, limits.report, band, channels, share, crew)
+            return forecast(work, resident, available, limits.maxmem_gb)
+
+        crew = muster(comm, census, grid, options, lambda crew: all(comm.gather(memory_of(crew).fits)))
+        found = memory_of(crew)
+        if all(comm.gather(found.fits)):
             break
     for line in found.lines():
         log.info(line)
-    return found
+    return found, crew
 
 
 def _channels(selection, grid):
@@ -87,7 +95,7 @@ def rehearse(selection, grid, options, blocks, limits):
         See :meth:`casa_sara.forecast.Forecast.summary`, with `seconds` of each part and `iterations`; `reason` instead where it
         does not fit.
     """
-    found = foresee(selection, grid, options, limits)
+    found, _ = foresee(selection, grid, options, limits)
     if not found.fits:
         try:
             found.require(limits.maxmem_gb)

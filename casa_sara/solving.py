@@ -12,7 +12,9 @@ from casa_sara.casa.products import CHECKPOINT
 from casa_sara.casa.weights import sampling_density
 from casa_sara.deadline import Deadline
 from casa_sara.interrupt import stop_on_interrupt
+from casa_sara.parallel import SERIAL
 from casa_sara.reconstruction import reconstruct, schedule_of
+from casa_sara.sharing import ALONE
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
 from casa_sara.timing import Pace
@@ -44,8 +46,8 @@ def checkpoint_of(selection, grid, options, output):
     return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
 
 
-def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None,
-                support=None):
+def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None, support=None,
+                crew=ALONE):
     """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
 
     Parameters
@@ -66,12 +68,14 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     watch : Watch, optional
     support : bool (nx, ny), optional
         The model is 0 elsewhere.
+    crew : casa_sara.sharing.Crew
+        The ranks that share the work; rank 0 decides when to stop.
 
     Returns
     -------
     Reconstruction
     """
-    density = sampling_density(data, selection, grid) if options.precondition else np.ones(data.size, np.float32)
+    density = sampling_density(data, selection, grid, crew.comm) if options.precondition else np.ones(data.size, np.float32)
     progress = log.Progress()
     expected = schedule_of(options).expected_iterations
 
@@ -85,10 +89,11 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
 
     with stop_on_interrupt() as pressed:
         reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
-                                     lambda: pressed() or bool(watch and watch.deadline.near()), checkpoint, support)
+                                     lambda: crew.comm.broadcast(pressed() or bool(watch and watch.deadline.near())),
+                                     checkpoint, support, crew)
     progress.close()
     record = reconstruction.record
-    if record.stop_code == STOPPED_BY_USER and not pressed():
+    if record.stop_code == STOPPED_BY_USER and not crew.comm.broadcast(pressed()):
         record.stop_code = TIME_LIMIT
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
@@ -102,7 +107,7 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     return reconstruction
 
 
-def without_wild(data, blocks, offsets, reconstruction):
+def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):
     """Leave out what the reconstruction left out, and say what that was."""
     wild = reconstruction.wild
     if not wild:
@@ -114,6 +119,6 @@ def without_wild(data, blocks, offsets, reconstruction):
                  f"the image has {one['predicted_jy']:.4g} Jy")
     if len(wild) > MOST_NAMED:
         log.warn(f"  … and {len(wild) - MOST_NAMED} more, in the record's 'wild'")
-    samples = np.diff(np.searchsorted(reconstruction.kept, offsets))
+    samples = comm.sum(np.diff(np.searchsorted(reconstruction.kept, offsets)))
     blocks = [replace(block, samples=int(count)) for block, count in zip(blocks, samples)]
     return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks

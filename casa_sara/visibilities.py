@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from casa_sara.parallel import SERIAL
+
 __all__ = ["BlockInfo", "RowTable", "Visibilities", "clock", "snapshot_blocks", "sort_into_blocks"]
 
 SNAPSHOT_SECONDS = 1800.0
@@ -111,12 +113,12 @@ class Visibilities:
     @property
     def max_uv(self) -> float:
         """Longest projected baseline in wavelengths."""
-        return float(np.sqrt(np.max(self.uvw[0] ** 2 + self.uvw[1] ** 2)))
+        return float(np.sqrt(np.max(self.uvw[0] ** 2 + self.uvw[1] ** 2, initial=0)))
 
     @property
     def max_w(self) -> float:
         """Largest |w| in wavelengths."""
-        return float(np.max(np.abs(self.uvw[2])))
+        return float(np.max(np.abs(self.uvw[2]), initial=0))
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ def clock(mjd_seconds):
     return str(np.datetime64("1858-11-17T00:00:00") + np.timedelta64(round(mjd_seconds), "s"))
 
 
-def snapshot_blocks(visibilities, blocks=0):
+def snapshot_blocks(visibilities, blocks=0, comm=SERIAL):
     """Split the samples into snapshots: spans over which errors may be taken as constant.
 
     Each block gets an ℓ2 bound of its own. The automatic rule (`blocks` = 0):
@@ -163,11 +165,13 @@ def snapshot_blocks(visibilities, blocks=0):
     visibilities : Visibilities
     blocks : int
         0 for the automatic rule, or the number of blocks.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread, in the order in which one rank alone has them.
 
     Returns
     -------
     block_of_sample : int32 (M,)
-        Numbers 0 … d−1 along MeasurementSets and time; every block holds a sample.
+        Numbers 0 … d−1 along MeasurementSets and time; every block holds a sample, on one of the ranks.
     infos : list of d BlockInfo
 
     Raises
@@ -175,40 +179,78 @@ def snapshot_blocks(visibilities, blocks=0):
     ValueError
         When `blocks` is negative or exceeds the number of samples.
     """
-    if not 0 <= blocks <= visibilities.size:
-        raise ValueError(
-            f"blocks = {blocks}: it takes 0 (automatic) or 1 to {visibilities.size}, the number of visibilities"
-        )
+    size = comm.total(visibilities.size)
+    if not 0 <= blocks <= size:
+        raise ValueError(f"blocks = {blocks}: it takes 0 (automatic) or 1 to {size}, the number of visibilities")
+    table, of_row = _integrations(visibilities, comm)
+    of_sample = of_row[visibilities.row]
     if blocks:
-        block_of_sample = _equal_blocks(visibilities, blocks)
+        block_of_sample = _equal_blocks(table, of_sample, blocks, comm)
     else:
-        block_of_sample = _blocks_of_rows(visibilities)[visibilities.row]
-    return block_of_sample, _block_infos(visibilities, block_of_sample)
+        block_of_sample = _blocks_of_rows(table)[of_sample]
+    return block_of_sample, _block_infos(visibilities.ms_names, table, of_sample, block_of_sample, comm)
 
 
-def _equal_blocks(visibilities, blocks):
-    """Return the block of every sample for a given number of blocks of equal size."""
+@dataclass
+class _Integrations:
+    """The integrations of all samples: rows that differ by their baselines alone are one; `samples` in each, (G,)."""
+
+    ms: np.ndarray
+    observation: np.ndarray
+    scan: np.ndarray
+    time: np.ndarray
+    interval: np.ndarray
+    samples: np.ndarray
+
+
+def _integrations(visibilities, comm):
+    """Return the integrations of all ranks, and the number (R,) of the one that each row of this rank belongs to."""
     rows = visibilities.rows
-    order = np.lexsort((rows.time[visibilities.row], rows.ms[visibilities.row]))
-    sizes = np.bincount(rows.ms[visibilities.row])
+    own, of_row = _distinct([getattr(rows, name) for name in list(_Integrations.__dataclass_fields__)[:-1]])
+    samples = np.bincount(of_row[visibilities.row], minlength=own[0].size)
+    lists = [np.concatenate(every) for every in zip(*comm.gather((*own, samples)))]
+    whole, of_own = _distinct(lists[:-1])
+    begin = sum(comm.gather(own[0].size)[: comm.rank])
+    table = _Integrations(*whole, samples=np.bincount(of_own, lists[-1], whole[0].size).astype(np.int64))
+    return table, of_own[begin : begin + own[0].size][of_row]
+
+
+def _distinct(columns):
+    """Return the distinct rows of a table of columns, sorted, and the number of each row among them."""
+    order = np.lexsort(columns[::-1])
+    new = np.any([np.diff(column[order]) != 0 for column in columns], axis=0)
+    number = np.empty(order.size, np.int64)
+    number[order] = np.concatenate([[0], np.cumsum(new)])[: order.size]
+    first = order[np.concatenate([[True], new])[: order.size]]
+    return [column[first] for column in columns], number
+
+
+def _equal_blocks(table, of_sample, blocks, comm):
+    """Return the block of every sample for a given number of blocks of equal size."""
+    (ms, _), of_integration = _distinct([table.ms, table.time])
+    moment = of_integration[of_sample]
+    before, counts = comm.place(np.bincount(moment, minlength=ms.size))
+    order = np.argsort(moment, kind="stable")
+    own = np.bincount(moment, minlength=ms.size)
+    place = np.empty(order.size, np.int64)  # of each sample along MeasurementSets and time
+    place[order] = np.arange(order.size) + np.repeat(np.cumsum(counts) - counts + before - np.cumsum(own) + own, own)
+    sizes = np.bincount(ms, counts).astype(np.int64)
     sizes = sizes[sizes > 0]
     if blocks < sizes.size:
-        sizes, shares = np.array([visibilities.size]), np.array([blocks])
+        sizes, shares = np.array([sizes.sum()]), np.array([blocks])
     else:
         shares = np.ones(sizes.size, dtype=int)
         for _ in range(blocks - sizes.size):
             shares[np.argmax(sizes / shares)] += 1
-    along = [np.arange(size) * share // size for size, share in zip(sizes, shares)]
-    starts = np.concatenate([[0], np.cumsum(shares)[:-1]])
-    block_of_sample = np.empty(visibilities.size, dtype=np.int32)
-    block_of_sample[order] = np.concatenate([start + part for start, part in zip(starts, along)])
-    return block_of_sample
+    ends = np.cumsum(sizes)
+    part = np.searchsorted(ends, place, "right")
+    along = (place - (ends - sizes)[part]) * shares[part] // sizes[part]
+    return ((np.cumsum(shares) - shares)[part] + along).astype(np.int32)
 
 
-def _blocks_of_rows(visibilities):
-    """Return the block int32 (R,) of every row by the automatic rule."""
-    rows = visibilities.rows
-    samples = np.bincount(visibilities.row, minlength=rows.time.size)
+def _blocks_of_rows(rows):
+    """Return the block int32 (G,) of every integration by the automatic rule."""
+    samples = rows.samples
     order = np.lexsort((rows.time, rows.observation, rows.ms))
     steps = [np.diff(column[order]) != 0 for column in (rows.ms, rows.observation)]
     steps.append(np.diff(rows.time[order]) > SESSION_GAP_SECONDS)
@@ -270,18 +312,19 @@ def _join_small(piece, session, time, samples):
     return number[piece]
 
 
-def _block_infos(visibilities, block_of_sample):
+def _block_infos(ms_names, rows, of_sample, block_of_sample, comm):
     """Describe every block."""
-    rows = visibilities.rows
-    samples = np.bincount(block_of_sample)
-    pairs = np.unique(block_of_sample.astype(np.int64) * rows.time.size + visibilities.row)
+    pairs, counts = np.unique(block_of_sample.astype(np.int64) * rows.time.size + of_sample, return_counts=True)
+    pairs, counts = (np.concatenate(every) for every in zip(*comm.gather((pairs, counts))))
+    samples = np.bincount(pairs // rows.time.size, counts)
+    pairs = np.unique(pairs)
     first = np.searchsorted(pairs, np.arange(samples.size + 1) * rows.time.size)
     infos = []
     for number, (begin, end) in enumerate(zip(first[:-1], first[1:])):
         here = pairs[begin:end] - number * rows.time.size
         infos.append(
             BlockInfo(
-                ms_name=", ".join(visibilities.ms_names[k] for k in np.unique(rows.ms[here])),
+                ms_name=", ".join(ms_names[k] for k in np.unique(rows.ms[here])),
                 observations=tuple(np.unique(rows.observation[here]).tolist()),
                 scans=tuple(np.unique(rows.scan[here]).tolist()),
                 start=float(np.min(rows.time[here] - rows.interval[here] / 2)),
@@ -292,7 +335,7 @@ def _block_infos(visibilities, block_of_sample):
     return infos
 
 
-def sort_into_blocks(visibilities, block_of_sample):
+def sort_into_blocks(visibilities, block_of_sample, blocks=0):
     """Return the same samples ordered so that each block is one slice.
 
     Parameters
@@ -300,6 +343,8 @@ def sort_into_blocks(visibilities, block_of_sample):
     visibilities : Visibilities
     block_of_sample : int (M,)
         Numbers 0 … d−1.
+    blocks : int
+        d, where some blocks may have no sample here.
 
     Returns
     -------
@@ -309,5 +354,5 @@ def sort_into_blocks(visibilities, block_of_sample):
         Block j is the slice offsets[j]:offsets[j + 1].
     """
     order = np.argsort(block_of_sample, kind="stable")
-    offsets = np.concatenate([[0], np.cumsum(np.bincount(block_of_sample))]).astype(np.int64)
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(block_of_sample, minlength=blocks))]).astype(np.int64)
     return visibilities.take(order), offsets

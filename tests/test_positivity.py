@@ -7,6 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.parallel import SERIAL
 from casa_sara.solver.positivity import Release
 
 SHAPE = (24, 20)
@@ -29,7 +30,7 @@ def _case(offset, flux=1.0, seed=0):
     model[model < 1e-6] = 0  # an interior-point solution only comes near its bounds
     scaled = MeasurementOperator(uv, 1.0, SHAPE, np.full(SAMPLES, 1 / NOISE), dtype=np.float64, eps=1e-10)
     ppd = SimpleNamespace(measurement=scaled, precond=np.ones(SAMPLES), spread=np.ones(SAMPLES), vis=vis, offsets=np.array([0, 600, SAMPLES]),
-                          model=model, lowest=np.zeros(SHAPE))
+                          model=model, lowest=np.zeros(SHAPE), adjoint=scaled.adjoint, comm=SERIAL)
     return ppd, SimpleNamespace(noise_weights=np.ones(2)), matrix, data
 
 

@@ -24,6 +24,7 @@ __all__ = ["ChildError", "in_child", "waiting_child"]
 
 JOBS = {"products": ("casa_sara.casa.products", "write_images"), "column": ("casa_sara.imaging", "write_column")}
 # sys.path comes along; the folder that Python puts first is the user's, whose files may have the names of modules
+_MPI = ("OMPI_", "PMIX_", "PMI_")  # variables by which a process knows that it is a rank
 _START = "import sys; sys.path[:] = sys.argv[1:]; del sys.argv[1:]; from casa_sara.casa.child import main; main()"
 
 
@@ -46,9 +47,10 @@ def waiting_child() -> Iterator[subprocess.Popen]:
 
 
 def _start():
-    """Return a new child process, which waits for a job on its standard input."""
+    """Return a new child process, which waits for a job on its standard input; it is no rank of an MPI job."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(_MPI)}
     return subprocess.Popen([sys.executable, "-c", _START, *filter(None, sys.path)], stdin=subprocess.PIPE,
-                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True)
+                            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True, env=environment)
 
 
 def in_child(job: str, child: subprocess.Popen | None = None, **arguments: Any) -> None:

@@ -9,9 +9,16 @@ import functools
 import sys
 import time
 
-__all__ = ["Progress", "error", "info", "warn"]
+__all__ = ["Progress", "error", "info", "speak", "warn"]
 
 ORIGIN = "casa_sara"
+_silent = False  # this process is one of several, and another one speaks
+
+
+def speak(speaks):
+    """Say whether this process writes to the log, and draws progress."""
+    global _silent
+    _silent = not speaks
 
 
 def _sink():
@@ -30,19 +37,24 @@ def _own_sink():
     return sink
 
 
+def _post(message, level):
+    if not _silent:
+        _sink().post(message, level, ORIGIN)
+
+
 def info(message):
     """Write a message to the CASA log."""
-    _sink().post(message, "INFO", ORIGIN)
+    _post(message, "INFO")
 
 
 def warn(message):
     """Write a warning to the CASA log, which also shows it on the terminal."""
-    _sink().post(message, "WARN", ORIGIN)
+    _post(message, "WARN")
 
 
 def error(message):
     """Write an error to the CASA log, which also shows it on the terminal."""
-    _sink().post(message, "SEVERE", ORIGIN)
+    _post(message, "SEVERE")
 
 
 class Progress:
@@ -61,7 +73,7 @@ class Progress:
     def __init__(self, interval=50, stream=None):
         self._interval = interval
         self._stream = sys.stderr if stream is None else stream
-        self._live = self._stream.isatty()
+        self._live = self._stream.isatty() and not _silent
         self._start = time.monotonic()
 
     def __call__(self, iteration, message, fraction=None):

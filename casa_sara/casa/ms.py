@@ -11,6 +11,7 @@ from casa_sara.casa.integrity import reading
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
 from casa_sara.casa.usable import IN_FLAGS, SMALLEST, Usability
+from casa_sara.sharing import ALONE
 from casa_sara.visibilities import RowTable, Visibilities
 
 __all__ = ["read_visibilities"]
@@ -28,10 +29,12 @@ _ROW_COLUMNS = {
     "antenna1": "ANTENNA1",
     "antenna2": "ANTENNA2",
 }
+_SAMPLE_DTYPES = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64, "row": np.int32,
+                  "chan": np.int16}
 _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64}
 
 
-def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
+def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, crew=ALONE):
     """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
 
     V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one hand there is, and as tclean (of circular, or of linear feeds)
@@ -61,6 +64,9 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
         'I', 'Q', 'U' or 'V'.
     frequencies : bool
         Keep the frequency of each sample.
+    crew : casa_sara.sharing.Crew
+        The ranks that read, each its rows: what is returned is this rank's, but the counts, notes and frequencies are of
+        all.
 
     Returns
     -------
@@ -76,23 +82,17 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
     selected, notes = select_data(selection, stokes)
     image = image_direction(phasecenter, selected)
     _check_directions(phasecenter, image, selected)
-    table = _SampleTable(frequencies)
-    low, high, unused = np.inf, 0.0, []
-    for ms in selected:
-        geometry = Geometry(ms, image)
-        with reading(ms.name), opened("table", ms.name) as tb:
-            before = table.size
-            for group in ms.groups:
-                for chunk in _chunks(tb, ms, group):
-                    table.add(chunk, ms, group, geometry)
-        if table.size == before:
-            unused.append(f"no sample of '{ms.name}' can be used: nothing of it is imaged")
-        low, high = min(low, geometry.freq_range_hz[0]), max(high, geometry.freq_range_hz[1])
+    comm = crew.comm
+    table, sizes, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, crew), frequencies)
+    sizes, ranges = np.sum(comm.gather(sizes), axis=0), np.concatenate(comm.gather(ranges))
+    unused = [f"no sample of '{ms.name}' can be used: nothing of it is imaged" for ms, size in zip(selected, sizes) if not size]
+    low, high = float(ranges[:, 0].min()), float(ranges[:, 1].max())
+    table.usable.merge(comm)
     dropped = table.usable.dropped
-    if table.size == 0:
+    if sizes.sum() == 0:
         raise ValueError(f"vis: no sample of {', '.join(selection.vis)} can be used: {_counts(dropped)}")
     if table.usable.strongest < SMALLEST:
-        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {table.size} samples of "
+        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {sizes.sum()} samples of "
                          f"{', '.join(selection.vis)} that can be used are zero: it may never have been filled")
     return table.visibilities(
         ms_names=tuple(selection.vis),
@@ -102,6 +102,40 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False):
         spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
         observatory=selected[0].observatory,
     )
+
+
+def _read_all(selected, image, pieces, frequencies):
+    """Return the table of the samples in these pieces, and the number of samples and the frequencies of each MeasurementSet."""
+    table, sizes, ranges = _SampleTable(frequencies), [], []
+    for ms in selected:
+        geometry, before = Geometry(ms, image), table.size
+        with reading(ms.name), opened("table", ms.name) as tb:
+            for number, group in enumerate(ms.groups):
+                for chunk in _chunks(tb, ms, group, pieces[ms.number, number]):
+                    table.add(chunk, ms, group, geometry)
+        sizes.append(table.size - before)
+        ranges.append(tuple(geometry.freq_range_hz))
+    return table, sizes, ranges
+
+
+def _own_pieces(selected, crew):
+    """Return the rows of each group, in pieces, that this rank reads: of all pieces, in order, an equal share of the samples."""
+    pieces = [((ms.number, number), rows, rows.size * group.channels.size)
+              for ms in selected for number, group in enumerate(ms.groups) for rows in _pieces(group)]
+    sizes = np.array([size for *_, size in pieces])
+    reader = ((np.cumsum(sizes) - sizes / 2) * crew.readers / sizes.sum()).astype(int)
+    own = {key: [] for key, *_ in pieces}
+    for (key, rows, _), number in zip(pieces, reader):
+        if number == crew.reader(crew.comm.rank):
+            own[key].append(rows)
+    return own
+
+
+def _pieces(group):
+    """Yield the rows of a group, as many as are read at a time."""
+    count = max(1, _CHUNK // (int(np.ptp(group.channels) + 1) * len(group.correlations)))
+    for start in range(0, group.rows.size, count):
+        yield group.rows[start : start + count]
 
 
 @dataclass
@@ -118,12 +152,10 @@ class _Chunk:
     flag_row: np.ndarray
 
 
-def _chunks(tb, ms, group):
+def _chunks(tb, ms, group, pieces):
     """Read the rows of a group in pieces."""
     weights = _weight_column(tb, group)
-    count = max(1, _CHUNK // (int(np.ptp(group.channels) + 1) * len(group.correlations)))
-    for start in range(0, group.rows.size, count):
-        rows = group.rows[start : start + count]
+    for rows in pieces:
         part = tb.selectrows(rows.tolist())
         try:
             yield _read(part, rows, ms.column, weights, group)
@@ -172,9 +204,9 @@ class _SampleTable:
         self.usable = Usability()
         self.size = 0
         self._rows_so_far = 0
-        self._samples = {name: [] for name in ("vis", "weight", "imaging_weight", "uvw", "row", "chan")}
-        self._samples |= {"freq_hz": []} if frequencies else {}
-        self._rows = {name: [] for name in RowTable.__dataclass_fields__}
+        self._samples = {name: [np.empty((3, 0) if name == "uvw" else 0, dtype)] for name, dtype in _SAMPLE_DTYPES.items()
+                         if frequencies or name != "freq_hz"}
+        self._rows = {name: [np.empty(0, _ROW_DTYPES.get(name, np.int32))] for name in RowTable.__dataclass_fields__}
 
     def add(self, chunk, ms, group, geometry):
         """Whiten, turn and append the usable samples of a chunk."""
@@ -192,17 +224,17 @@ class _SampleTable:
         number = self._rows_so_far + np.cumsum(kept) - 1
         channel = np.broadcast_to(group.channels, ok.shape)
         new = {
-            "vis": vis.astype(np.complex64),
-            "weight": (hands**2 / sum(1 / hand for hand in weight)).astype(np.float32),
-            "imaging_weight": (sum(hand[ok] for hand in chunk.parallel) / len(chunk.parallel)).astype(np.float32),
+            "vis": vis,
+            "weight": hands**2 / sum(1 / hand for hand in weight),
+            "imaging_weight": sum(hand[ok] for hand in chunk.parallel) / len(chunk.parallel),
             "uvw": np.array([axis[ok] for axis in uvw]),
-            "row": np.repeat(number, ok.sum(axis=1)).astype(np.int32),
-            "chan": channel[ok].astype(np.int16),
+            "row": np.repeat(number, ok.sum(axis=1)),
+            "chan": channel[ok],
         }
         if "freq_hz" in self._samples:
-            new["freq_hz"] = geometry.frequencies(group, columns["field"], columns["time"])[ok].astype(np.float32)
+            new["freq_hz"] = geometry.frequencies(group, columns["field"], columns["time"])[ok]
         for name, values in new.items():
-            self._samples[name].append(values)
+            self._samples[name].append(values.astype(_SAMPLE_DTYPES[name], copy=False))
         of_group = {name: np.full(kept.size, value) for name, value in (("ms", ms.number), ("spw", group.spw))}
         for name, values in (columns | of_group | {"row": chunk.rows}).items():
             self._rows[name].append(values[kept].astype(_ROW_DTYPES.get(name, np.int32)))

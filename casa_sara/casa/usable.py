@@ -52,6 +52,12 @@ class Usability:
         self.strongest = max([self.strongest, *(hand.max(where=ok, initial=0.0) for hand in strength)])
         return ok
 
+    def merge(self, comm):
+        """Add up what all ranks of a communicator have left out."""
+        every = comm.gather(self.dropped)
+        self.dropped = {reason: sum(one.get(reason, 0) for one in every) for one in every for reason in one}
+        self.strongest = comm.largest(self.strongest)
+
     def _leave_out(self, ok, reason, bad):
         """Take `bad` samples out of `ok` and count them."""
         count = int(np.count_nonzero(ok & bad))

@@ -22,6 +22,7 @@ from casa_sara.casa.quantities import radians
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
 from casa_sara.casa.usable import IN_FLAGS
+from casa_sara.parallel import SERIAL
 
 __all__ = ["dirty_image", "imaging_weights", "sampling_density", "sum_of_weights"]
 
@@ -31,7 +32,7 @@ _SELECTVIS_KEYS = {"timerange": "time", "antenna": "baseline"}
 _WAVELENGTHS = re.compile(r"\s*(\d+\.?\d*|\.\d+)(e[-+]?\d+)?\s*(k|M|)(lambda)?\s*", re.IGNORECASE)
 
 
-def sampling_density(visibilities, selection, grid):
+def sampling_density(visibilities, selection, grid, comm=SERIAL):
     """Density of the sampling at every sample, from casatools imager's uniform weighting.
 
     The uv cells are square, of side 1/(field of view) of the larger image side. imager reads
@@ -47,6 +48,8 @@ def sampling_density(visibilities, selection, grid):
         That is read again; None where the samples are not all of a selection, but those of one channel of a cube, and
         so are counted here.
     grid : casa_sara.options.ImageGrid
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread; rank 0 asks imager.
 
     Returns
     -------
@@ -60,21 +63,21 @@ def sampling_density(visibilities, selection, grid):
     cells = _cells(u, v, (side, side), (cell, cell))
     density = np.zeros(visibilities.size, np.float32)
     if selection is not None and visibilities.dropped.keys() <= set(IN_FLAGS):
-        for number in np.unique(visibilities.rows.ms):
+        for number in np.unique(np.concatenate(comm.gather(np.unique(visibilities.rows.ms)))):
             try:
-                density += _imager_grid(visibilities.ms_names[number], selection.of(number), side, cell)[cells]
+                density += comm.once(_imager_grid, visibilities.ms_names[number], selection.of(number), side, cell)[cells]
             except RuntimeError as error:
                 raise ValueError(f"vis = '{visibilities.ms_names[number]}': CASA finds no density of the samples, on {side} x "
                                  f"{side} cells for imsize = {list(grid.shape)}: {' '.join(str(error).split())}") from error
     weight = visibilities.imaging_weight
     bad = ~((density >= 0.5 * weight) & np.isfinite(density))
-    if bad.any():
+    if comm.total(np.count_nonzero(bad)):
         opposite = _cells(-u, -v, (side, side), (cell, cell))
-        density[bad] = _count(cells, opposite, weight, side * side)[cells[bad]]
+        density[bad] = comm.sum(_count(cells, opposite, weight, side * side))[cells[bad]]
     return np.maximum(density, weight)
 
 
-def imaging_weights(visibilities, grid, weighting):
+def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     """tclean's imaging weights of every sample, which make the PSF and the residual image.
 
     With w the natural weight and G the summed natural weight in the sample's uv cell:
@@ -91,6 +94,8 @@ def imaging_weights(visibilities, grid, weighting):
     visibilities : casa_sara.visibilities.Visibilities
     grid : casa_sara.options.ImageGrid
     weighting : casa_sara.options.Weighting
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
 
     Returns
     -------
@@ -109,7 +114,7 @@ def imaging_weights(visibilities, grid, weighting):
         shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
         to_cell = np.rint if grid.is_cube else np.trunc
         cells = _cells(-u, v, shape, grid.cell_rad, to_cell)
-        counts = _count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights, shape[0] * shape[1])
+        counts = comm.sum(_count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights, shape[0] * shape[1]))
         if not counts.any():
             raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
         density = counts[cells]
@@ -132,7 +137,7 @@ def sum_of_weights(visibilities, selection, weights, stokes="I"):
     return float(np.dot(weights, hands[visibilities.row]))
 
 
-def dirty_image(operator, vis, weights):
+def dirty_image(operator, vis, weights, comm=SERIAL):
     """Re Σ_m w_m V_m exp(−2πi(u_m·l + v_m·m)) / Σ w, in Jy/beam.
 
     With vis = 1 this is the PSF, whose centre is 1.
@@ -142,12 +147,14 @@ def dirty_image(operator, vis, weights):
     operator : MeasurementOperator, without whitening
     vis : complex (M,), or 1
     weights : real (M,)
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread; the operator sums over them.
 
     Returns
     -------
     image : real (nx, ny)
     """
-    total = float(weights.sum(dtype=np.float64))
+    total = comm.total(float(weights.sum(dtype=np.float64)))
     if not total > 0:
         raise ValueError("the imaging weights of all samples are zero: weighting, npixels or uvtaper leave nothing")
     return operator.adjoint(weights * vis) / operator.dtype.type(total)

@@ -20,9 +20,13 @@ class Workers:
             raise ValueError(f"nthreads={count} must be at least 1")
         self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
 
-    def run(self, kernel, *args):
-        """Call kernel(*args, worker, count) for each worker, all at once, and wait."""
-        others = [self._pool.submit(kernel, *args, worker, self.count) for worker in range(1, self.count)]
-        kernel(*args, 0, self.count)
+    def run(self, kernel, *args, part=(0, 1)):
+        """Call kernel(*args, worker, count) for each worker, all at once, and wait.
+
+        With part = (p, n) these are workers p·count, p·count + 1, … of n·count: the others are in other processes.
+        """
+        first, count = part[0] * self.count, part[1] * self.count
+        others = [self._pool.submit(kernel, *args, first + worker, count) for worker in range(1, self.count)]
+        kernel(*args, first, count)
         for other in others:
             other.result()

@@ -19,7 +19,7 @@ from casa_sara.operators._wavelet_weights import RING_ROWS, neighbourhood_weight
 from casa_sara.operators._workers import Workers
 from casa_sara.options import SARA_BASES
 
-__all__ = ["Band", "SaraDictionary", "coefficient_bytes"]
+__all__ = ["Band", "SaraDictionary", "coefficient_bytes", "filter_lengths"]
 
 CACHE_LINE = 64
 ORIENTATIONS = ("aa", "ad", "da", "dd")
@@ -49,6 +49,8 @@ class SaraDictionary:
         Of images and coefficients.
     nthreads : int
         Threads used by each call; results are the same, to the last bit, for any number.
+    n_bases : int, optional
+        Of the whole dictionary, where `wavelets` are a share of it, which may be empty: the gain is that of the whole.
 
     Attributes
     ----------
@@ -67,26 +69,27 @@ class SaraDictionary:
     The workspaces belong to the object: one call at a time.  Different objects may be used from different threads.
     """
 
-    def __init__(self, shape, wavelets=SARA_BASES, levels=4, dtype=np.float32, nthreads=1):
+    def __init__(self, shape, wavelets=SARA_BASES, levels=4, dtype=np.float32, nthreads=1, n_bases=None):
         self.shape = tuple(int(n) for n in shape)
         self.wavelets = tuple(wavelets)
         self.levels, self.dtype = int(levels), np.dtype(dtype)
+        self.n_bases = len(self.wavelets) if n_bases is None else int(n_bases)
         self._validate()
-        self.n_bases = len(self.wavelets)
         padded = _padded(self.shape, self.levels)
-        self.coef_shape = (self.n_bases, *padded)
-        self.n_coefs = self.n_bases * padded[0] * padded[1]
-        self._filters = _filters(self.wavelets, self.dtype)
+        self.coef_shape = (len(self.wavelets), *padded)
+        self.n_coefs = len(self.wavelets) * padded[0] * padded[1]
+        self._filters = _filters(self.wavelets, self.n_bases, self.dtype)
         self._workers = Workers(nthreads)
         self._work = self._workspaces()
-        self._params = np.zeros((self.n_bases, 2), self.dtype)
+        self._params = np.zeros((len(self.wavelets), 2), self.dtype)
         self._ring = np.zeros((self._workers.count, RING_ROWS, padded[1]), self.dtype)
-        self._rectangles = np.array([_rectangle(band) for band in self.bands()])
+        self._rectangles = np.array([_rectangle(band) for band in self.bands()], np.int64).reshape(-1, 5)
 
     def _validate(self):
         if len(self.shape) != 2 or min(self.shape) < 1:
             raise ValueError(f"imsize must be two sizes of at least 1 pixel, not {self.shape}")
-        if not self.wavelets or len(set(self.wavelets)) < len(self.wavelets) or set(self.wavelets) - set(SARA_BASES):
+        if not len(set(self.wavelets)) == len(self.wavelets) <= self.n_bases or not self.n_bases \
+                or set(self.wavelets) - set(SARA_BASES):
             raise ValueError(f"wavelets={list(self.wavelets)} must be distinct names out of {list(SARA_BASES)}")
         if not 1 <= self.levels <= 10:
             raise ValueError(f"wavelevels={self.levels} must be between 1 and 10")
@@ -99,7 +102,7 @@ class SaraDictionary:
         approx = _approximations((nx, ny), self.levels, size)
         width = kernels.padded_width(ny + 2 * kernels.HALO, size)
         return kernels.Work(
-            levels=self.levels, approx=_aligned((self.n_bases, approx), self.dtype),
+            levels=self.levels, approx=_aligned((len(self.wavelets), approx), self.dtype),
             owner=_shares(self._filters.lengths, threads),
             window=_aligned((threads, kernels.WINDOW_ROWS, width), self.dtype),
             scratch=_aligned((threads, kernels.SCRATCH_ROWS, width), self.dtype),
@@ -251,10 +254,10 @@ def _aligned(shape, dtype):
     return array
 
 
-def _filters(wavelets, dtype):
+def _filters(wavelets, n_bases, dtype):
     """Lay the taps out as the kernels read them."""
-    gain = 1 / np.sqrt(len(wavelets))
-    lengths = np.array([0 if name == "dirac" else pywt.Wavelet(name).dec_len for name in wavelets])
+    gain = 1 / np.sqrt(n_bases)
+    lengths = filter_lengths(wavelets)
     analysis = np.zeros((2, len(wavelets), 2, kernels.MAX_TAPS))
     synthesis = np.zeros_like(analysis)
     for b, (name, length) in enumerate(zip(wavelets, lengths)):
@@ -268,6 +271,11 @@ def _filters(wavelets, dtype):
             synthesis[0, b, 1, :length] = odd_pixels[:, ::-1].T.ravel()
     analysis[1], synthesis[1] = gain * analysis[0], gain * synthesis[0]
     return kernels.Filters(lengths, analysis.astype(dtype), synthesis.astype(dtype), dtype.type(gain))
+
+
+def filter_lengths(wavelets):
+    """Return the number of taps of each basis, int (b,), 0 for Dirac."""
+    return np.array([0 if name == "dirac" else pywt.Wavelet(name).dec_len for name in wavelets], np.int64)
 
 
 def _shares(costs, workers):

@@ -21,8 +21,9 @@ from casa_sara.operators._workers import Workers
 from casa_sara.operators.decimation import (
     AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable)
 from casa_sara.operators.nufft import NonUniformFFT, memory_size
+from casa_sara.parallel import SERIAL
 
-__all__ = ["SMALLEST_EPS", "MeasurementOperator", "check_cell", "check_field", "choose_eps", "grid_bytes"]
+__all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "check_cell", "check_field", "choose_eps", "grid_bytes", "share_of"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 LARGEST_EPS = 1e-4
@@ -50,6 +51,9 @@ class MeasurementOperator:
         Of images; visibilities are complex of the same precision.
     nthreads : int
         Threads used by each call.
+    whole : (int, (float, float)), optional
+        Number of all visibilities and their largest |u| and |v| in wavelengths, where `uv` is a share of them: grid and
+        kernel, and with them the errors, are those of the whole.
 
     Attributes
     ----------
@@ -62,7 +66,7 @@ class MeasurementOperator:
         For an argument out of these ranges, or a `cell` too large for the longest baseline.
     """
 
-    def __init__(self, uv, cell_rad, shape, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1):
+    def __init__(self, uv, cell_rad, shape, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1, whole=None):
         uv = np.asarray(uv, dtype=np.float64)
         if uv.ndim != 2 or uv.shape[0] != 2 or uv.shape[1] == 0 or not np.all(np.isfinite(uv)):
             raise ValueError(f"uv must be finite and of shape (2, M) with M >= 1, not {uv.shape}")
@@ -84,18 +88,21 @@ class MeasurementOperator:
         lower = frequencies[1] < 0  # V(−u, −v) is the conjugate of V(u, v)
         np.negative(frequencies, out=frequencies, where=lower)
         np.negative(scales[:, 1], out=scales[:, 1], where=lower)
-        self._plan(frequencies, scales, eps / 2)
+        if whole is None:
+            whole = self.size, np.abs([frequencies.min(axis=1), frequencies.max(axis=1)]).max(axis=0)
+        else:
+            whole = whole[0], np.asarray(whole[1]) * np.broadcast_to(np.asarray(cell_rad, np.float64), (2,))
+        self._plan(frequencies, scales, eps / 2, *whole)
 
-    def _plan(self, frequencies, scales, eps):
+    def _plan(self, frequencies, scales, eps, n_points, reach):
         """Decimation along both axes, then the transform of what it leaves; `frequencies` and `scales` are used up."""
-        axes = _decimations(self.shape, np.abs([frequencies.min(axis=1), frequencies.max(axis=1)]).max(axis=0), eps,
-                            self.dtype)
+        axes = _decimations(self.shape, reach, eps, self.dtype)
         for axis, frequency in zip(axes, frequencies):
             scales /= axis.response(frequency)[:, None]
             frequency -= axis.centre
             frequency *= axis.factor
         starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
-        self._nufft = NonUniformFFT(frequencies, scales, starts, counts, eps, self.dtype, self.workers)
+        self._nufft = NonUniformFFT(frequencies, scales, starts, counts, eps, self.dtype, self.workers, n_points)
         self._rows, self._columns = (
             separable(axis, size, cells, factors, self.complex_dtype)
             for axis, size, (cells, factors) in zip(axes, self.shape, self._nufft.placement))
@@ -124,6 +131,48 @@ class MeasurementOperator:
         self.workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
         self.workers.run(expand_rows, self._lines, self._rows, out)
         return out
+
+
+class NoVisibilities:
+    """The operator of a process that holds none: `forward` returns nothing, `adjoint` an empty image."""
+
+    def __init__(self, shape, dtype=np.float32, nthreads=1):
+        self.shape, self.size, self.dtype = tuple(shape), 0, np.dtype(dtype)
+        self.complex_dtype, self.workers = np.result_type(self.dtype, np.complex64), Workers(nthreads)
+
+    def forward(self, image, out=None):
+        """Return no visibilities."""
+        return np.empty(0, self.complex_dtype) if out is None else out
+
+    def adjoint(self, vis, out=None):
+        """Return zeros (nx, ny), in `out` where given."""
+        out = np.empty(self.shape, self.dtype) if out is None else out
+        out.fill(0)
+        return out
+
+
+class Summed:
+    """An operator whose visibilities are spread over the ranks of a communicator: `adjoint` is the sum of theirs."""
+
+    def __init__(self, measurement, comm):
+        self._measurement, self._comm = measurement, comm
+        self.shape, self.dtype, self.workers = measurement.shape, measurement.dtype, measurement.workers
+        self.forward = measurement.forward
+
+    def adjoint(self, vis, out=None):
+        """Return the image of all visibilities, on every rank."""
+        return self._comm.sum(self._measurement.adjoint(vis, out))
+
+
+def share_of(uv, *arguments, comm=SERIAL, **options):
+    """Return the operator of this rank's visibilities; arguments and errors as of :class:`MeasurementOperator`."""
+    if comm.size == 1:
+        return MeasurementOperator(uv, *arguments, **options)
+    reach = [comm.largest(float(np.abs(axis).max(initial=0))) for axis in uv]
+    whole = comm.total(uv.shape[1]), reach
+    if uv.shape[1]:
+        return MeasurementOperator(uv, *arguments, whole=whole, **options)
+    return NoVisibilities(arguments[1], nthreads=options.get("nthreads", 1))
 
 
 def check_cell(uv, cell_rad):
@@ -187,7 +236,7 @@ def _checked(array, name, shape, dtype):
     return array
 
 
-def choose_eps(vis, weight, dtype=np.float32):
+def choose_eps(vis, weight, dtype=np.float32, comm=SERIAL):
     """Return the accuracy at which the operator's errors are far below the noise of the image.
 
     The errors in the naturally weighted dirty image are below eps times its peak, in practice a tenth of that; the
@@ -201,11 +250,13 @@ def choose_eps(vis, weight, dtype=np.float32):
         Inverse variance of the real part and of the imaginary part, 1/Jy².
     dtype : float32 or float64
         Of the operator.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the visibilities are spread.
 
     Returns
     -------
     float
         At most 1e-4, and not less than the operator can.
     """
-    peak, total = np.sum(weight * np.abs(vis), dtype=np.float64), np.sum(weight, dtype=np.float64)
+    peak, total = comm.sum(np.array([np.sum(values, dtype=np.float64) for values in (weight * np.abs(vis), weight)]))
     return float(np.clip(np.sqrt(total) / max(peak, 1e-300), SMALLEST_EPS[np.dtype(dtype)], LARGEST_EPS))

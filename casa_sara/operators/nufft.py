@@ -53,11 +53,13 @@ class NonUniformFFT:
         Relative accuracy.
     dtype : float32 or float64
     workers : Workers
+    n_points : int, optional
+        For how many points the plan is made, M unless given.
     """
 
-    def __init__(self, frequencies, scales, starts, counts, eps, dtype, workers):
+    def __init__(self, frequencies, scales, starts, counts, eps, dtype, workers, n_points=None):
         self._workers = workers
-        width, sigma, self._lengths = _least_work(frequencies.shape[1], starts, counts, eps, dtype)
+        width, sigma, self._lengths = _least_work(n_points or frequencies.shape[1], starts, counts, eps, dtype)
         beta = kaiser_bessel.kernel_shape(width, sigma)
         self._kernel = _kernel(width, beta, dtype)
         self._halo = width // 2 + 1

@@ -14,10 +14,11 @@ from math import prod
 
 import numpy as np
 
-from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator
+from casa_sara.operators.measurement import SMALLEST_EPS, NoVisibilities, share_of
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
 from casa_sara.operators.widefield import WTerm, w_operator
 from casa_sara.options import LARGEST_INDEX
+from casa_sara.parallel import SERIAL
 
 __all__ = ["further_bytes", "sky_operator"]
 
@@ -26,7 +27,7 @@ SERIES_SAMPLE, SERIES_PIXEL = 16, 16  # rotation and one term; place, two polyno
 GRIDDER_SAMPLE, GRIDDER_PIXEL = 80, 80  # what it holds, and the grids and indices of a call
 
 
-def sky_operator(uvw, grid, freq_hz=None, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1):
+def sky_operator(uvw, grid, freq_hz=None, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1, comm=SERIAL):
     """Return the measurement operator of an image.
 
     Parameters
@@ -39,16 +40,24 @@ def sky_operator(uvw, grid, freq_hz=None, row_scale=None, eps=1e-6, dtype=np.flo
         Frequencies; without them the sky is as bright at all frequencies as at the reference.
     row_scale, eps, dtype, nthreads
         As of :class:`casa_sara.operators.measurement.MeasurementOperator`, whose interface the result has.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the visibilities are spread; the result is of this rank's.
     """
+    def of_place(row_scale, eps):
+        return _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm)
+
     spectrum = grid.spectrum if freq_hz is not None else None
     if spectrum is None:
-        return _of_place(uvw, grid, row_scale, eps, dtype, nthreads)
+        return of_place(row_scale, eps)
     ratio = np.log(np.asarray(freq_hz, np.float64) / spectrum.reference_hz)
     if np.ndim(spectrum.index) == 0:
         scale = np.exp(float(spectrum.index) * ratio)
-        return _of_place(uvw, grid, scale if row_scale is None else scale * row_scale, eps, dtype, nthreads)
+        return of_place(scale if row_scale is None else scale * row_scale, eps)
     if np.shape(spectrum.index) != grid.shape:
         raise ValueError(f"spectralindex must have the shape {grid.shape} of the image, not {np.shape(spectrum.index)}")
+    base = of_place(row_scale, max(eps / 2, SMALLEST_EPS[np.dtype(dtype)]))
+    if not base.size:
+        return base
     # (ν/ν0)^α = (ν/ν0)^α0 exp(c s), with α = α0 + h s and c = h ln(ν/ν0)
     low, high = float(np.min(spectrum.index)), float(np.max(spectrum.index))
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
@@ -56,15 +65,17 @@ def sky_operator(uvw, grid, freq_hz=None, row_scale=None, eps=1e-6, dtype=np.flo
     factors = bessel_factors(half * ratio, terms, modified=True, dtype=np.dtype(dtype))
     factors *= np.exp(middle * ratio)
     place = (np.asarray(spectrum.index, np.float64) - middle) / max(half, np.finfo(float).tiny)
-    base = _of_place(uvw, grid, row_scale, max(eps / 2, SMALLEST_EPS[np.dtype(dtype)]), dtype, nthreads)
     return ModulatedOperator(base, place.astype(dtype), factors)
 
 
-def _of_place(uvw, grid, row_scale, eps, dtype, nthreads):
+def _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm):
     """The operator of a sky that does not change with frequency."""
-    if grid.gridder == "wproject":
-        return w_operator(uvw, grid.cell_rad, grid.shape, row_scale, eps, dtype, nthreads)
-    return MeasurementOperator(uvw[:2], grid.cell_rad, grid.shape, row_scale, eps, dtype, nthreads)
+    if grid.gridder == "standard":
+        return share_of(uvw[:2], grid.cell_rad, grid.shape, row_scale=row_scale, eps=eps, dtype=dtype, nthreads=nthreads,
+                        comm=comm)
+    if not uvw.shape[1] and comm.size > 1:
+        return NoVisibilities(grid.shape, dtype, nthreads)
+    return w_operator(uvw, grid.cell_rad, grid.shape, row_scale, eps, dtype, nthreads)
 
 
 def further_bytes(samples, grid, max_w=0.0, band=0.0, eps=1e-6):

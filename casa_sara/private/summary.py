@@ -130,7 +130,7 @@ def _sara(result, options, full):
     data = result.data
     sara = {
         "version": casa_sara.__version__,
-        "visibilities": data.size,
+        "visibilities": result.size,
         "dropped": dict(data.dropped),
         "notes": list(data.notes),
         "blocks": [_block(result, j) for j in range(len(result.blocks))],

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,8 @@ from casa_sara.casa.spectrum import check_spectral_index
 from casa_sara.cube import make_cube
 from casa_sara.imaging import make_image
 from casa_sara.options import Comparing, ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.parallel import SERIAL
+from casa_sara.private.launch import in_parallel
 from casa_sara.private.summary import cube_summary, summary
 from casa_sara.rehearsal import rehearse
 from casa_sara.resources import available_cores
@@ -33,32 +37,47 @@ ARCSEC = math.pi / 180 / 3600
 
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
+    return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
+
+
+def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
+    """Run the task on the ranks of a communicator, of which rank 0 alone writes; return the same on all."""
     log.info(f"casa_sara {casa_sara.__version__}")
     _check_stokes(parameters)
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
                           tuple(parameters["uvtaper"]))
-    options = _solver_options(parameters)
+    options = _solver_options(parameters, comm)
     _refuse_for_cubes(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
+    if parameters["dryrun"] and comm.size > 1:
+        raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank stands in "
+                         "the first lines of the log of the run itself, docs/parallel.md tells the time")
     if parameters["dryrun"]:
         return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
-    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked)
-    with one_run_of(parameters["imagename"]):
-        recover_products(parameters["imagename"])
-        output = _output(parameters)
-        if output.savemodel == "modelcolumn":
-            check_model_column_writable(selection)
-        _warn_of_incomplete(selection.vis, output)
-        make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
+    make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
+    with ExitStack() as stack:
+        output = comm.once(_prepare, parameters, selection, grid, stack)
         result = make(selection, grid, weighting, options, output,
                       lambda result: tell(result, options, full=True)["sara"], limits)
         if parameters["report"]:
-            _report(output.imagename, selection, options.nthreads)
+            comm.once(_report, output.imagename, selection, options.nthreads)
         elif not output.images_stand:
-            folder.remove(Path(output.imagename + REPORT))  # of older images
-    return tell(result, options, parameters["fullsummary"])
+            comm.once(folder.remove, Path(output.imagename + REPORT))  # of older images
+    return comm.broadcast(tell(result, options, parameters["fullsummary"]))
+
+
+def _prepare(parameters, selection, grid, stack):
+    """Take the imagename for as long as the stack lasts, and return the options of the output."""
+    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked)
+    stack.enter_context(one_run_of(parameters["imagename"]))
+    recover_products(parameters["imagename"])
+    output = _output(parameters)
+    if output.savemodel == "modelcolumn":
+        check_model_column_writable(selection)
+    _warn_of_incomplete(selection.vis, output)
+    return output
 
 
 def _warn_of_incomplete(vis, output):
@@ -131,6 +150,9 @@ def _refuse_for_cubes(parameters):
     if parameters["savemodel"] != "none":
         raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written from "
                          "continuum images only; should be 'none'")
+    if parameters["parallel"]:
+        raise ValueError("parallel = True with specmode = 'cube': several processes share one continuum image; should be "
+                         "False, with channels shared among runs by start and nchan")
     if parameters["stokes"] != "I":
         raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes are of Stokes I; should be 'I'")
     if parameters["usemask"] == "pb" or parameters["mask"]:
@@ -197,7 +219,7 @@ def _seconds(maxtime):
     return span
 
 
-def _solver_options(parameters):
+def _solver_options(parameters, comm):
     if parameters["databound"] == "fixed" and not parameters["l2bound"]:
         raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
                          "blocks or one for each, in units of what the weights say")
@@ -205,8 +227,14 @@ def _solver_options(parameters):
         raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the noise")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}
     values = {name: tuple(value) if isinstance(value := parameters[name], list) else value for name in names}
-    nthreads = min(parameters["nthreads"] or available_cores(), os.cpu_count() or 1)
+    nthreads = min(parameters["nthreads"] or _own_cores(comm), os.cpu_count() or 1)
     return SolverOptions(nthreads=nthreads, **values)
+
+
+def _own_cores(comm):
+    """Cores that this process may use, shared with the ranks that may use the same ones."""
+    cores = frozenset(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    return max(1, available_cores() // comm.same_here(cores))
 
 
 def _output(parameters):

@@ -75,6 +75,14 @@ def primal_step(model, anchor, model_bar, data_gradient, prior_gradient, steps, 
 
 
 @_jit
+def add_scaled(data_gradient, prior_gradient, l2_step, worker, workers):
+    """Ψu ← ηΦ†v + Ψu."""
+    for i in range(data_gradient.shape[0] * worker // workers, data_gradient.shape[0] * (worker + 1) // workers):
+        for k in range(data_gradient.shape[1]):
+            prior_gradient[i, k] += l2_step * data_gradient[i, k]
+
+
+@_jit
 def nnls_step(model, momentum, gradient, step, penalty, positivity, uphill, worker, workers):
     """Replace the gradient g at the momentum point m by x⁺ = m + step·g, less the penalty towards 0, x⁺ ≥ 0 if `positivity`.
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.parallel import SERIAL
 from casa_sara.solver import _kernels as kernels
 from casa_sara.solver.prox import ellipsoid_multiplier
 from casa_sara.solver.statefile import fill
 
-__all__ = ["AdaptivePPD"]
+__all__ = ["BASIS_ARRAYS", "SAMPLE_ARRAYS", "AdaptivePPD"]
 
 RELAXATION = 1.8
 STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor", "spread",
                 "multipliers", "residual_norms")
+SAMPLE_ARRAYS, BASIS_ARRAYS = ("l2_dual", "_phi_anchor", "spread"), ("l1_dual", "l1_weights")  # where ranks differ
 STATE_VALUES = ("threshold", "rel_change", "iteration")
 
 
@@ -58,9 +60,14 @@ class AdaptivePPD:
         x ≥ 0, or only real.
     relaxation : float
         ρ.
+    comm : casa_sara.parallel.Serial or MPI
+        Where ranks share the work, each has its own samples of every block, its own bases, and the same images: a step
+        needs one sum of the image's gradient over them, and of the d squared residual norms.
 
     Attributes
     ----------
+    begins, block_sizes : int (d,)
+        How many of a block's samples lie on ranks before this one, and on all.
     model, model_bar : real (nx, ny)
         x and x̄.
     anchor : real (nx, ny)
@@ -86,26 +93,27 @@ class AdaptivePPD:
     """
 
     def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True,
-                 relaxation=RELAXATION):
-        self.measurement, self.dictionary = measurement, dictionary
+                 relaxation=RELAXATION, comm=SERIAL):
+        self.measurement, self.dictionary, self.comm = measurement, dictionary, comm
         self.vis, self.precond, self.offsets = vis, precond, np.asarray(offsets)
         self.relaxation = relaxation
         self.tau, self.l2_step = 0.495, 1.0 / data_norm_sq
         dtype = vis.real.dtype
-        self.model = np.zeros(measurement.shape, dtype)
-        self.anchor, self.model_bar = np.zeros_like(self.model), np.zeros_like(self.model)
-        self.lowest = np.full_like(self.model, 0 if positivity else -np.inf)
-        self._data_gradient, self._prior_gradient = np.zeros_like(self.model), np.zeros_like(self.model)
+        self.model, self.anchor, self.model_bar, self.lowest = comm.images(4, measurement.shape, dtype)
+        self.lowest[...] = 0 if positivity else -np.inf
+        self._data_gradient, self._prior_gradient = (np.zeros(measurement.shape, dtype) for _ in range(2))
         self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
         self.spread = np.ones_like(precond)
         self.l1_dual, self.l1_weights = dictionary.allocate(), None
         self.threshold = 0.0
         self.multipliers = np.zeros(self.n_blocks)
         self.l2_bounds = None
-        self.residual_norms = np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()])
+        self.begins, self.block_sizes = comm.place(np.diff(self.offsets))
+        self.residual_norms = comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()]))
+        self._norms_sq = np.zeros(self.n_blocks)
         self.rel_change = np.inf
         self.model_flux = self.model_max = 0.0
-        self._sums = np.zeros((measurement.shape[0], 4))
+        self._sums, = comm.images(1, (measurement.shape[0], 4), float)
         self.iteration = 0
         self.unit_jy = 1.0
 
@@ -121,21 +129,22 @@ class AdaptivePPD:
     def confine(self, support):
         """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}."""
         self.lowest[~support] = np.inf
+        self.comm.settle()
 
     def start_from(self, model):
         """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay."""
-        self.model[...] = model
-        self.model[self.lowest == np.inf] = 0
-        self.anchor[...] = self.model
-        self.model_bar[...] = self.model
+        for image in (self.model, self.anchor, self.model_bar):
+            image[...] = model  # ranks of one machine write the same
+            image[self.lowest == np.inf] = 0
+        self.comm.settle()
         self.measurement.forward(self.model, self._phi_anchor)
 
     def step(self):
         """Do one iteration."""
         # Steps 5–6: data
         self.measurement.forward(self.model_bar, self._phi_bar)
-        for j, (start, stop) in enumerate(self.blocks()):
-            self._data_step(j, start, stop)
+        self._data_step()
+        norms_sq = self.comm.start_sum(self._norms_sq)
         self.measurement.adjoint(self.l2_dual, self._data_gradient)
         # Step 13: prior
         self.dictionary.dual_step(self.model_bar, self.l1_dual, self.threshold, self.l1_weights, self._prior_gradient,
@@ -143,21 +152,38 @@ class AdaptivePPD:
         # Steps 17–19: image
         dtype = self.model.dtype.type
         steps = dtype(self.tau), dtype(self.l2_step), dtype(self.relaxation)
-        self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, self._data_gradient,
-                                     self._prior_gradient, steps, self.lowest, self._sums)
-        change, norm, self.model_flux = self._sums[:, :3].sum(axis=0).tolist()
-        self.model_max = float(self._sums[:, 3].max())
+        gradients, steps = self._summed_gradients(steps)
+        self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, *gradients, steps,
+                                     self.lowest, self._sums, part=self.comm.part)
+        self.comm.settle()
+        np.sqrt(norms_sq(), out=self.residual_norms)
+        sums = [*self._sums[:, :3].sum(axis=0).tolist(), float(self._sums[:, 3].max())]
+        change, norm, self.model_flux, self.model_max = self.comm.broadcast(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
         self.iteration += 1
 
-    def _data_step(self, j, start, stop):
+    def _data_step(self):
         args, real = (self.l2_dual, self._phi_bar, self.vis, self.precond), self.precond.dtype.type
         relaxation = real(self.relaxation)
-        self.residual_norms[j] = np.sqrt(
-            kernels.residual_norm_sq(self.vis, self._phi_bar, self._phi_anchor, relaxation, start, stop))
-        if self.l2_bounds is not None:
-            self.multipliers[j] = ellipsoid_multiplier(*args, self.l2_bounds[j], self.multipliers[j], start, stop)
-        kernels.update_dual(*args, self.spread, real(self.multipliers[j]), relaxation, start, stop)
+        for j, (start, stop) in enumerate(self.blocks()):
+            self._norms_sq[j] = kernels.residual_norm_sq(self.vis, self._phi_bar, self._phi_anchor, relaxation, start, stop)
+            if self.l2_bounds is not None:
+                self.multipliers[j] = ellipsoid_multiplier(*args, self.l2_bounds[j], self.multipliers[j], start, stop,
+                                                           comm=self.comm)
+            kernels.update_dual(*args, self.spread, real(self.multipliers[j]), relaxation, start, stop)
+
+    def _summed_gradients(self, steps):
+        """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both."""
+        gradients = self._data_gradient, self._prior_gradient
+        if self.comm.size == 1:
+            return gradients, steps
+        self.measurement.workers.run(kernels.add_scaled, *gradients, steps[1])
+        gradient = self.comm.sum(self._prior_gradient)
+        return (gradient, gradient), (steps[0], type(steps[1])(0), steps[2])
+
+    def adjoint(self, vis, out=None):
+        """Return Φ†·vis of the samples of all ranks."""
+        return self.comm.sum(self.measurement.adjoint(vis, out))
 
     def rescale(self, threshold):
         """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.
@@ -188,6 +214,7 @@ class AdaptivePPD:
             self.l1_weights = self.dictionary.allocate()
         for name in STATE_ARRAYS:
             fill(getattr(self, name), state[name])
+        self.comm.settle()
         for name in STATE_VALUES:
             setattr(self, name, state[name])
         self.l2_bounds = None if state["l2_bounds"] is None else np.array(state["l2_bounds"])

@@ -64,14 +64,14 @@ class Checkpoint:
             raise self.refusal(error) from None
 
     def identify(self, **data):
-        """Say what the data are, by arrays or None, and hold that against what was read.
+        """Say what the data are, by arrays, their digests or None, and hold that against what was read.
 
         Raises
         ------
         CheckpointError
             The checkpoint is of other data.
         """
-        self._header["data"] = {name: digest(np.ascontiguousarray(values)) if values is not None else None
+        self._header["data"] = {name: digest(np.ascontiguousarray(values)) if isinstance(values, np.ndarray) else values
                                 for name, values in data.items()}
         self._due = time.monotonic() + INTERVAL
         if self.state is not None:
@@ -81,15 +81,26 @@ class Checkpoint:
                 raise self.refusal(f"it is of other data: {', '.join(different)} differ")
 
     @contextmanager
-    def applied(self):
-        """Yield `state`, to be put to use: what does not fit is a reason to refuse it; afterwards it is let go."""
+    def applied(self, read=True):
+        """Yield `state`, to be put to use: what does not fit is a reason to refuse it; afterwards it is let go.
+
+        With `read` = False it was another rank that has read it, and says so.
+        """
         try:
             yield self.state
+        except CheckpointError:
+            raise
         except (LookupError, TypeError, ValueError, AttributeError) as error:
             raise self.refusal(f"its state does not fit ({error})") from None
+        if not read:
+            return
         age = time.time() - self._found["written"]
         self.tell(f"resuming from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
         self.state = None
+
+    def due(self, now=False):
+        """Return whether it is time to write, as it is whenever it has to be `now`."""
+        return now or time.monotonic() >= self._due
 
     def keep(self, make_state, iteration, now=False):
         """Write `make_state()` when it is time, or `now`.
@@ -97,7 +108,7 @@ class Checkpoint:
         What a full disk, or the like, prevents is said in the log and tried again: the run matters more.
         """
         begun = time.monotonic()
-        if not now and begun < self._due:
+        if not self.due(now):
             return
         try:
             write(self.path, self._header | dict(iteration=iteration, written=time.time()), make_state())

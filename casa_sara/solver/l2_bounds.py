@@ -178,12 +178,12 @@ class AdaptiveBounds(_NoiseLevels):
         shares = np.zeros(ppd.n_blocks)
         for j, (start, stop) in enumerate(ppd.blocks()):
             power = np.abs(model_vis[start:stop]) ** 2
-            shares[j] = _amplitude_share(power, np.abs(ppd.vis[start:stop] - model_vis[start:stop]) ** 2)
+            shares[j] = _amplitude_share(power, np.abs(ppd.vis[start:stop] - model_vis[start:stop]) ** 2, ppd.comm)
             if shares[j] > 0:
-                ppd.spread[start:stop] = 1 / (1 - shares[j] + shares[j] * power / power.mean())
+                ppd.spread[start:stop] = 1 / (1 - shares[j] + shares[j] * power / ppd.comm.mean(power))
             else:
                 ppd.spread[start:stop] = 1
-        self.weight_sums = np.add.reduceat(self.sample_weights * ppd.spread, ppd.offsets[:-1], dtype=float)
+        self.weight_sums = ppd.comm.block_sums(self.sample_weights * ppd.spread, ppd.offsets)
         self._artefacts = float(np.average(shares, weights=self.l2_bounds**2))
 
     def adapt(self, ppd):
@@ -208,10 +208,11 @@ class AdaptiveBounds(_NoiseLevels):
         return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > self.tol * self.l2_bounds
 
 
-def _amplitude_share(power, residual_power):
+def _amplitude_share(power, residual_power, comm):
     """Share of the residual power that is proportional to `power`, from its means over bright and faint samples."""
-    bright = power > power.mean()
-    if np.count_nonzero(bright) < FEWEST or np.count_nonzero(~bright) < FEWEST:
+    mean, brightness = comm.mean, comm.mean(power)
+    bright = power > brightness
+    if min(comm.total(np.count_nonzero(bright)), comm.total(np.count_nonzero(~bright))) < FEWEST:
         return 0.0
-    slope = (residual_power[bright].mean() - residual_power[~bright].mean()) / (power[bright].mean() - power[~bright].mean())
-    return float(np.clip(slope * power.mean() / residual_power.mean(), 0, LARGEST_SHARE))
+    slope = (mean(residual_power[bright]) - mean(residual_power[~bright])) / (mean(power[bright]) - mean(power[~bright]))
+    return float(np.clip(slope * brightness / mean(residual_power), 0, LARGEST_SHARE))

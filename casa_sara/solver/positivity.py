@@ -55,7 +55,9 @@ class Release:
         around = binary_dilation(both, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
         before = np.count_nonzero(ppd.lowest)
         lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
+        ppd.comm.settle()  # all ranks of one machine have counted, and write the same
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around & (ppd.lowest < np.inf))
+        ppd.comm.settle()
         return int(np.count_nonzero(ppd.lowest) - before)
 
     def state(self):
@@ -73,6 +75,6 @@ def _wanted(ppd, bounds):
     weights *= np.repeat(bounds.noise_weights.astype(weights.dtype), np.diff(ppd.offsets))
     image = np.zeros_like(ppd.model)
     image[0, 0] = 1
-    noise_sq = float(ppd.measurement.adjoint(ppd.precond * weights * ppd.measurement.forward(image), image)[0, 0])
-    gradient = ppd.measurement.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)), image)
+    noise_sq = float(ppd.adjoint(ppd.precond * weights * ppd.measurement.forward(image), image)[0, 0])
+    gradient = ppd.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)), image)
     return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest) & (ppd.lowest < np.inf)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.parallel import SERIAL
 from casa_sara.solver import _kernels as kernels
 
 __all__ = ["ellipsoid_multiplier", "project_ellipsoid"]
 
 
-def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, start=0, stop=None, tol=1e-10):
+def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, start=0, stop=None, tol=1e-10, comm=SERIAL):
     """Lagrange multiplier of the projection onto one data ellipsoid.
 
     The projection of s = U⁻¹v + Φx̄ in the metric U onto {z : ‖z − y‖ ≤ ε} is
@@ -31,6 +32,8 @@ def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, sta
         First guess, e.g. that of the iteration before.
     start, stop : int
         The block is samples start … stop − 1.
+    comm : casa_sara.parallel.Serial or MPI
+        Whose ranks hold the samples of the block.
 
     Returns
     -------
@@ -43,12 +46,12 @@ def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, sta
         When the iteration does not settle, which only non-finite data can cause.
     """
     stop = vis.size if stop is None else stop
-    norm_sq, _ = kernels.shifted_norms(dual, phi_bar, vis, precond, 0.0, start, stop)
+    norm_sq, _ = _norms(comm, dual, phi_bar, vis, precond, 0.0, start, stop)
     if norm_sq <= bound * bound:
         return 0.0
     value = float(multiplier)
     for _ in range(100):
-        norm_sq, slope = kernels.shifted_norms(dual, phi_bar, vis, precond, value, start, stop)
+        norm_sq, slope = _norms(comm, dual, phi_bar, vis, precond, value, start, stop)
         norm = np.sqrt(norm_sq)
         # Newton on 1/n − 1/ε, whose derivative is −n'/n² = slope/n³
         new = max(value + (1 / bound - 1 / norm) * norm**3 / slope, 0.0)
@@ -56,6 +59,12 @@ def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, sta
             return new
         value = new
     raise RuntimeError("the projection onto a data ellipsoid did not converge: are the visibilities finite?")
+
+
+def _norms(comm, *arguments):
+    """n² and −½ d(n²)/dλ of the samples of all ranks."""
+    norms = kernels.shifted_norms(*arguments)
+    return norms if comm.size == 1 else comm.sum(np.array(norms)).tolist()
 
 
 def project_ellipsoid(point, centre, precond, bound):

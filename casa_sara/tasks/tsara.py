@@ -73,7 +73,7 @@ PARAMETERS = (
     Parameter('restart', ('bool',), False, 'Go on from imagename.checkpoint, or else continue from imagename.model'),
     Parameter('overwrite', ('bool',), False, 'Replace existing images'),
     Parameter('savemodel', ('string',), 'none', 'Options to save model visibilities (none, modelcolumn)', allowed=('none', 'modelcolumn')),
-    Parameter('parallel', ('bool',), False, 'Run on several processes', allowed=(False,)),
+    Parameter('parallel', ('bool',), False, 'Run on the processes of an MPI job'),
 )
 
 
@@ -534,8 +534,13 @@ class _tsara:
         untouched. Together with restart=True and niter=0 it writes the visibilities of the existing
         imagename.model and leaves the images as they are: also where a run was killed in this phase.
 
-    parallel : {False}, default False
-        Only False: the task runs in one process, with nthreads threads.
+    parallel : bool, default False
+        True shares data, wavelets and memory among the processes (ranks) of an MPI job, on one machine or several; the
+        image is the same. Start the script with "mpirun -n 4 python script.py", where every rank calls the
+        task, or with "mpicasa -n 5 casa -c script.py", where casampi's client has its servers do it. It
+        takes mpi4py (pip install casa_sara[mpi]) and Open MPI or MPICH. nthreads, and maxmem, are those
+        of each rank; nthreads=0 shares the cores of a machine among its ranks. See docs/parallel.md.
+        False runs in one process, with nthreads threads.
 
     Returns
     -------

@@ -1,0 +1,70 @@
+"""Which rank does what, so that all are ready at the same time.
+
+The cost of one iteration, in ns on one core, measured by benchmarks/parallel.py at 2048² in single precision.  Only their
+ratios matter.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from casa_sara.operators.dictionary import filter_lengths
+from casa_sara.operators.measurement import grid_bytes
+from casa_sara.sharing import Crew
+
+__all__ = ["basis_costs", "muster", "operator_costs"]
+
+DIRAC, WAVELET, TAP = 2.3, 3.3, 0.17  # of a pixel: the pixel basis, a wavelet, and more for each tap
+PIXEL, CELL, SAMPLE = 5.0, 22.0, 150.0  # of the operator and its adjoint: a pixel, a cell of the uv grid, a visibility
+CELL_BYTES = 8
+
+
+def basis_costs(wavelets, shape):
+    """Seconds of each basis, float (b,)."""
+    taps = filter_lengths(wavelets)
+    return np.where(taps > 0, WAVELET + TAP * taps, DIRAC) * math.prod(shape) * 1e-9
+
+
+def operator_costs(census, grid):
+    """Seconds that the operator takes on every rank that has visibilities, and those that these ranks share."""
+    reach = [min(max(wave * cell, 1e-6), 0.5) for wave, cell in zip(census.reach, grid.cell_rad)]
+    cells = grid_bytes(census.samples, reach, grid.shape) / CELL_BYTES
+    return (PIXEL * math.prod(grid.shape) + CELL * cells) * 1e-9, SAMPLE * census.samples * 1e-9
+
+
+def muster(comm, census, grid, options, fits=lambda crew: True):
+    """Return who does what: the fastest arrangement in which all have room.
+
+    Every rank that has visibilities does a whole Fourier transform, so their number, too, is chosen for the least time; the
+    bases then go to whoever has least to do, the costly ones first.
+
+    Parameters
+    ----------
+    comm : casa_sara.parallel.Serial or MPI
+    census : casa_sara.casa.census.Census
+    grid : casa_sara.options.ImageGrid
+    options : casa_sara.options.SolverOptions
+    fits : callable
+        Tells whether a crew has room for its work; the same on every rank.
+
+    Returns
+    -------
+    Crew
+    """
+    if comm.size == 1:
+        return Crew(comm)
+    bases = basis_costs(options.wavelets, grid.shape) * (options.niter > 0)
+    fixed, shared = operator_costs(census, grid)
+    plans = []
+    for readers in range(1, comm.size + 1):
+        crew = Crew(comm, readers)
+        load = np.array([0.0 if crew.reader(rank) is None else fixed + shared / readers for rank in range(comm.size)])
+        owners = np.zeros(bases.size, int)
+        for basis in np.argsort(-bases, kind="stable"):
+            owners[basis] = np.argmin(load)
+            load[owners[basis]] += bases[basis]
+        plans.append((load.max(), Crew(comm, readers, tuple(owners.tolist()))))
+    plans.sort(key=lambda plan: plan[0])
+    return next((crew for _, crew in plans if fits(crew)), plans[0][1])
