@@ -36,6 +36,7 @@ html_theme = "furo"
 html_title = "casa_sara"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_js_files = ["pictures.js"]
 html_copy_source = False
 
 

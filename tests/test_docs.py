@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import casa_sara
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")])
@@ -43,6 +45,10 @@ def test_links_to_code_name_what_is_there(page):
         path, name = (page.parent / target).resolve(), text.strip("`")
         if path.suffix == ".py" and sourcepages.is_definition(name, path):
             sourcepages.line_of(path, name, title)
+
+
+def test_citation_is_of_this_version():
+    assert f"\nversion: {casa_sara.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_line_of_finds_definitions_and_texts(tmp_path):

@@ -5,10 +5,12 @@ The page api/library has the modules that stand beside the packages. Modules tha
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2] / "casa_sara"
 BESIDE = "library"
+SEVERAL = re.compile(r"\w+(, \w+)+(?= :|$)")  # attributes in one line
 
 
 def modules(page: str) -> list[str]:
@@ -20,7 +22,7 @@ def modules(page: str) -> list[str]:
 
 def api_page(page: str) -> str:
     """Return the sections of an API page, in MyST Markdown."""
-    parts = [f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n   :show-inheritance:\n```"
+    parts = [f"## {name}\n\n```{{eval-rst}}\n.. automodule:: {name}\n   :members:\n```"
              for name in modules(page)]
     return "\n\n".join(parts) + "\n"
 
@@ -32,8 +34,13 @@ def _append(app, docname, source):
 
 
 def _as_text(app, what, name, obj, options, lines):
-    """Escape bars and asterisks: the docstrings mean |u| and U*V as they stand there."""
+    """Escape bars and asterisks: the docstrings mean |u| and U*V as they stand there; keep names together that share a text."""
+    attributes = False
     for number, line in enumerate(lines):
+        if line.startswith("---"):
+            attributes = lines[number - 1] == "Attributes"
+        if attributes and SEVERAL.match(line):
+            line = lines[number] = SEVERAL.sub(lambda names: names[0].replace(", ", ","), line)
         if "``" not in line:
             lines[number] = line.replace("|", r"\|").replace("*", r"\*")
 

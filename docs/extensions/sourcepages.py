@@ -66,7 +66,9 @@ def page_of(path: Path) -> str:
 
 def is_definition(text: str, path: Path) -> bool:
     """Return whether the text of a link to a file is meant as a name in it, rather than as that of the file."""
-    return text not in (path.stem, path.name) and all(part.isidentifier() for part in text.split("."))
+    if text == path.name or text == path.stem and text not in definitions(path):
+        return False
+    return all(part.isidentifier() for part in text.split("."))
 
 
 def setup(app):

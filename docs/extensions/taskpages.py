@@ -90,7 +90,7 @@ def _overview(task: Task) -> str:
     """Return the table of all parameters, sub-parameters indented, as `inp` shows them."""
     rows = ["| Parameter | Default | |", "|---|---|---|"]
     for param in task.params:
-        indent = "&emsp;" * param.subparam
+        indent = "&nbsp;&nbsp;&nbsp;" * param.subparam
         rows.append(f"| {indent}[`{param.name}`](#{task.name}-{param.name}) | {_default(param)} | "
                     f"{_escaped(param.summary)} |")
     return "\n".join(rows)

@@ -97,7 +97,7 @@ def as_text(cells, refusal, blocks, truth):
     lines += ["", refusal, "", "| blocks | noise found | SNR at the beam | at half the beam |", "|---|---|---|---|"]
     for number, run in blocks.items():
         found = ", ".join(f"{block['noise_found']:.2f}" for block in run.blocks)
-        lines.append(f"| {number} | {found} | {run.snr_beam:.1f} dB | {run.snr_half:.1f} dB |")
+        lines.append(f"| {number or '0 (automatic)'} | {found} | {run.snr_beam:.1f} dB | {run.snr_half:.1f} dB |")
     return "\n".join(lines)
 
 
