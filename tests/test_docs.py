@@ -100,10 +100,10 @@ def test_task_page_has_every_parameter_with_its_facts(xml):
 
 
 def test_help_becomes_markdown():
-    text = ("Takes *all* of mode='soft' or x_y='z'.\n\n- one\n  more\n- two\n\nKept:\n  a.b   first\n    c   second\n\n"
+    text = ("Takes '' and *all* of mode='soft' or x_y='z'.\n\n- one\n  more\n- two\n\nKept:\n  a.b   first\n    c   second\n\n"
             "Examples: mode='soft'\n          mode='hard'   (very)")
     assert taskpages.as_markdown(text, "small", ["mode"]) == (
-        "Takes \\*all\\* of [`mode='soft'`](#small-mode) or x\\_y='z'.\n\n- one more\n\n- two\n\nKept:\n\n"
+        "Takes `''` and \\*all\\* of [`mode='soft'`](#small-mode) or x\\_y='z'.\n\n- one more\n\n- two\n\nKept:\n\n"
         "```text\na.b   first\n  c   second\n```\n\n```python\nmode='soft'\nmode='hard'   (very)\n```")
 
 
