@@ -1,4 +1,4 @@
-"""Choosing cell and blocks: the same sky on pixels of several sizes, and bad snapshots with and without a bound of their own.
+"""Choosing cell and blocks: one sky on pixels of several sizes, and noisy snapshots with one bound each or for all.
 
     python docs/tutorials/cell_and_blocks.py [folder]
 
@@ -46,7 +46,7 @@ def simulate(folder, sky, **more):
 
 
 def main(folder):
-    """Do it all; return the runs by cell in arcsec, the words of the refusal, the runs by blocks, and the sky's pixels."""
+    """Do it all; return the runs by cell in arcsec, the words of the refusal, the runs by blocks, and the sky."""
     sky = cyg_a_like(tuple(round(side / FINE) for side in WIDE), FINE, oversampling=1)
     truth = sky.truth()
     with quiet(folder / "casa.txt"):
