@@ -19,6 +19,7 @@ extensions = [
     "taskpages", "apipages", "sourcepages",
 ]
 root_doc = "index"
+smartquotes = False  # texts are shown as they are written
 default_role = "code"  # what stands between single backticks in docstrings
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import casa_sara
+
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
 PAGES = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *DOCS.rglob("*.md")])
@@ -45,9 +47,14 @@ def test_links_to_code_name_what_is_there(page):
             sourcepages.line_of(path, name, title)
 
 
+def test_citation_is_of_this_version():
+    assert f"\nversion: {casa_sara.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+
+
 def test_line_of_finds_definitions_and_texts(tmp_path):
     path = tmp_path / "small.py"
-    path.write_text("LIMIT = 3\n\n\nclass Box:\n    size: int = 0\n\n    def open(self):\n        # Step 2: lift\n        pass\n")
+    path.write_text("LIMIT = 3\n\n\nclass Box:\n    size: int = 0\n\n"
+                    "    def open(self):\n        # Step 2: lift\n        pass\n")
     lines = {name: sourcepages.line_of(path, name) for name in ("LIMIT", "Box", "Box.size", "Box.open")}
     assert lines == {"LIMIT": 1, "Box": 4, "Box.size": 5, "Box.open": 7}
     assert sourcepages.line_of(path, "Box.open", "Step 2") == 8
@@ -59,7 +66,8 @@ def test_line_of_finds_definitions_and_texts(tmp_path):
 def test_every_step_of_the_paper_is_in_the_algorithm_page():
     text = (DOCS / "algorithm.md").read_text()
     for step in (5, 6, 7, 8, 9, 13, 17, 18, 19):
-        rows = [row for row in text.splitlines() if row.startswith("| Step") and re.search(rf"\b{step}\b", row.split("|")[1])]
+        rows = [row for row in text.splitlines()
+                if row.startswith("| Step") and re.search(rf"\b{step}\b", row.split("|")[1])]
         assert any(".py" in row for row in rows), f"Step {step}"
 
 
@@ -94,10 +102,11 @@ def test_task_page_has_every_parameter_with_its_facts(xml):
 
 
 def test_help_becomes_markdown():
-    text = ("Takes *all* of mode='soft' or x_y='z'.\n\n- one\n  more\n- two\n\nKept:\n  a.b   first\n    c   second\n\n"
+    text = ("Takes '' and *all* of mode='soft' or x_y='z'.\n\n- one\n  more\n- two\n\n"
+            "Kept:\n  a.b   first\n    c   second\n\n"
             "Examples: mode='soft'\n          mode='hard'   (very)")
     assert taskpages.as_markdown(text, "small", ["mode"]) == (
-        "Takes \\*all\\* of [`mode='soft'`](#small-mode) or x\\_y='z'.\n\n- one more\n\n- two\n\nKept:\n\n"
+        "Takes `''` and \\*all\\* of [`mode='soft'`](#small-mode) or x\\_y='z'.\n\n- one more\n\n- two\n\nKept:\n\n"
         "```text\na.b   first\n  c   second\n```\n\n```python\nmode='soft'\nmode='hard'   (very)\n```")
 
 

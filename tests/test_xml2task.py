@@ -197,8 +197,8 @@ def test_error_names_the_file_and_fails_the_command(tmp_path, capsys):
 def test_check_names_every_stale_file_and_writes_nothing(tmp_path, capsys):
     command = ["--root", str(tmp_path)]
     write(tmp_path, SMALL)
-    write(tmp_path, SMALL.replace('name="small"', 'name="tiny"').replace("small(", "tiny(").replace("inp small", "inp tiny"),
-          "tiny")
+    tiny = SMALL.replace('name="small"', 'name="tiny"').replace("small(", "tiny(").replace("inp small", "inp tiny")
+    write(tmp_path, tiny, "tiny")
     assert xml2task.main([*command, "--check"]) == 1
     assert not (tmp_path / "casa_sara").exists()
     assert xml2task.main(command) == 0 and xml2task.main([*command, "--check"]) == 0

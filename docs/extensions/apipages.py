@@ -34,7 +34,7 @@ def _append(app, docname, source):
 
 
 def _as_text(app, what, name, obj, options, lines):
-    """Escape bars and asterisks: the docstrings mean |u| and U*V as they stand there; keep names together that share a text."""
+    """Escape bars and asterisks, which the docstrings mean as they stand; keep names together that share a text."""
     attributes = False
     for number, line in enumerate(lines):
         if line.startswith("---"):

@@ -1,13 +1,13 @@
 """Pages with the source code, and links to lines of it that are found when the site is built.
 
-A link to a Python file, as `[text](../casa_sara/noise.py)`, opens the page of that file. Where its text is the name of a
-function, a class or a method of the file, as in
+A link to a Python file, as `[text](../casa_sara/noise.py)`, opens the page of that file. Where its text is the name
+of a function, a class or a method of the file, as in
 
     [`AdaptivePPD.step`](../casa_sara/solver/adaptive_ppd.py "Step 13")
 
-it opens the line of its definition and says the number; with a title, the line within the definition that holds this text.
-A name or a text that is not there is an error of the build. Links to folders and to other files of the repository, which
-have no page, are for readers of the repository: on the site they are plain text.
+it opens the line of its definition and says the number; with a title, the line within the definition that holds this
+text. A name or a text that is not there is an error of the build. Links to folders and other files of the repository,
+which have no page, are for readers of the repository: on the site they are plain text.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-FOLDERS = ("casa_sara", "docs/tutorials", "tools")
+FOLDERS = ("casa_sara", "docs", "tools")  # whose files have pages
 
 
 class NotThere(LookupError):
@@ -105,6 +105,9 @@ def setup(app):
 
         def link(self, node, path):
             text, fragment, where = node.astext(), "", []
+            if not path.exists() or path.relative_to(ROOT).parts[0] not in FOLDERS:
+                logger.warning("%s has no page", path, location=node)
+                return node.children
             if is_definition(text, path):
                 try:
                     line = line_of(path, text, node.get("reftitle", ""))

@@ -83,7 +83,7 @@ def _linked(text: str, task: str, names: list[str]) -> str:
 
 
 def _escaped(text: str) -> str:
-    return SPECIAL.sub(r"\\\1", text)
+    return SPECIAL.sub(r"\\\1", text).replace("''", "`''`")
 
 
 def _overview(task: Task) -> str:

@@ -28,7 +28,8 @@ WEIGHTS_TOO_HIGH = 4.0  # in the second: its noise is twice what its weights say
 def simulate(folder):
     """Observe a radio galaxy in the configurations B and C, well but for one antenna, and one set of weights."""
     observation = Observation(scans=6, integrations=8, channels=1, weight_scale=(1.0, WEIGHTS_TOO_HIGH))
-    simulation = simulate_observation(folder, cyg_a_like(SIZE, CELL_ARCSEC), "BC", NOISE_DB, GAIN_RMS, SEED, observation)
+    sky = cyg_a_like(SIZE, CELL_ARCSEC)
+    simulation = simulate_observation(folder, sky, "BC", NOISE_DB, GAIN_RMS, SEED, observation)
     spoil(simulation.vis[0])
     return simulation.vis
 
@@ -66,7 +67,8 @@ def find_and_leave_out(vis, name):
 def as_text(before, after):
     """Return the table of the blocks."""
     left = {(Path(block["ms"]).name, *block["scans"]): block["noise_found"] for block in after}
-    lines = ["| MeasurementSet, scan | noise measured | noise found | found without the bad scan |", "|---|---|---|---|"]
+    lines = ["| MeasurementSet, scan | noise measured | noise found | found without the bad scan |",
+             "|---|---|---|---|"]
     for block in before:
         key = Path(block["ms"]).name, *block["scans"]
         without = f"{left[key]:.2f}" if key in left else "–"

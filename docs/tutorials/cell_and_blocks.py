@@ -1,4 +1,4 @@
-"""Choosing cell and blocks: the same sky on pixels of several sizes, and bad snapshots with and without a bound of their own.
+"""Choosing cell and blocks: one sky on pixels of several sizes, and noisy snapshots with one bound each or for all.
 
     python docs/tutorials/cell_and_blocks.py [folder]
 
@@ -46,7 +46,7 @@ def simulate(folder, sky, **more):
 
 
 def main(folder):
-    """Do it all; return the runs by cell in arcsec, the words of the refusal, the runs by blocks, and the sky's pixels."""
+    """Do it all; return the runs by cell in arcsec, the words of the refusal, the runs by blocks, and the sky."""
     sky = cyg_a_like(tuple(round(side / FINE) for side in WIDE), FINE, oversampling=1)
     truth = sky.truth()
     with quiet(folder / "casa.txt"):
@@ -97,7 +97,7 @@ def as_text(cells, refusal, blocks, truth):
     lines += ["", refusal, "", "| blocks | noise found | SNR at the beam | at half the beam |", "|---|---|---|---|"]
     for number, run in blocks.items():
         found = ", ".join(f"{block['noise_found']:.2f}" for block in run.blocks)
-        lines.append(f"| {number} | {found} | {run.snr_beam:.1f} dB | {run.snr_half:.1f} dB |")
+        lines.append(f"| {number or '0 (automatic)'} | {found} | {run.snr_beam:.1f} dB | {run.snr_half:.1f} dB |")
     return "\n".join(lines)
 
 
