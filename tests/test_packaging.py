@@ -52,7 +52,9 @@ ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["forecast"] = {"casa_sara.operators"}
 ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
-ROOMS["rehearsal"] = {"casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", *NUMERICS}
+ROOMS["rehearsal"] = {
+    "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", "numpy", *NUMERICS,
+}
 ROOMS["solving"] = {
     "casa_sara", "casa_sara.casa", "casa_sara.deadline", "casa_sara.interrupt", "casa_sara.timing", "numpy", *NUMERICS,
 }
