@@ -143,7 +143,8 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     # write
     with waiting_child() as child:  # which starts meanwhile
         images = plane_images(data, model, selection, grid, weighting, options, plane)
-        result = Result(data, blocks, noise, reconstruction, images.residual_peak, images.model_flux, forecast.summary())
+        result = Result(data, blocks, noise, reconstruction, images.residual_peak, images.model_flux,
+                        forecast.summary())
         write_products(output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
     if result.finished or not checkpoint.stands:  # else one of an older run
         checkpoint.remove()

@@ -44,7 +44,7 @@ class Selection:
 
 @dataclass(frozen=True)
 class ImageGrid:
-    """The image: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive, and the spectral axis of a cube.
+    """The image: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive; and the axis of a cube.
 
     `start` and `width` are '', a channel number or a quantity; `nchan` is -1 where the data tell it.
     """

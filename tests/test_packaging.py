@@ -27,8 +27,8 @@ ROOMS = {
     "tasks": {"casa_sara.private"},
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
     "private": {
-        "casa_sara", "casa_sara.cube", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal", "casa_sara.resources",
-        "casa_sara.solver",
+        "casa_sara", "casa_sara.cube", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal",
+        "casa_sara.resources", "casa_sara.solver",
         "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
     },
     "interrupt": set(),

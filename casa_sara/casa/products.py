@@ -161,7 +161,8 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     check_imagename(output.imagename, plane.pb.shape)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
-            in_child("products", child, root=root, plane=vars(plane), images=images, sumwt=np.asarray(sumwt, np.float32), beam=beam,
+            in_child("products", child, root=root, plane=vars(plane), images=images,
+                     sumwt=np.asarray(sumwt, np.float32), beam=beam,
                      restoringbeam=output.restoringbeam, history=output.history)
             if record is not None:
                 jsonfile.save(root + RECORD, record)

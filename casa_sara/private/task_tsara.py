@@ -110,11 +110,11 @@ def _refuse_for_cubes(parameters):
     if parameters["specmode"] != "cube":
         return
     if parameters["savemodel"] != "none":
-        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written from "
-                         "continuum images only; should be 'none'")
+        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written "
+                         "from continuum images only; should be 'none'")
     if parameters["npixels"]:
-        raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': the uv cell of a channel is that of the "
-                         "image; should be 0")
+        raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': the uv cell of a channel is that "
+                         "of the image; should be 0")
     if parameters["report"]:
         raise ValueError("report = True with specmode = 'cube': the report is of one image; should be False")
 
