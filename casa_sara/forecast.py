@@ -180,9 +180,9 @@ class Forecast:
         least = self.resident + self.needed
         limit = f"maxmem = {maxmem_gb:g} GB" if maxmem_gb else "the memory available"
         raise MemoryError(
-            f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of vis "
-            f"takes {least / 1e9:.2f} GB while {self.peak_phase} ({parts}, held now {self.resident / 1e9:.2f}); {limit} "
-            f"allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
+            f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of "
+            f"vis takes {least / 1e9:.2f} GB while {self.peak_phase} ({parts}, held now {self.resident / 1e9:.2f}); "
+            f"{limit} allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
 
     def _what_fits(self):
         """The largest image of this shape, and the most visibilities."""
