@@ -16,6 +16,7 @@ from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.spectralaxis import SpectralAxis, channel_number, channels_of, samples_of_channels, spectral_axis
 from casa_sara.options import ImageGrid, Selection
 from casa_sara.solver.record import CONVERGED, TIME_LIMIT
+from casa_sara.timing import STARTING, Timing
 
 ARCSEC = np.pi / 180 / 3600
 GRID = dict(imsize=[64, 60], cell="10arcsec", datacolumn="data", specmode="cube")
@@ -221,13 +222,18 @@ def test_model_cube_to_start_from(line, solved):
         tsara(imagename="other", startmodel=solved[0] + ".model", niter=0, **options | dict(nchan=3))
 
 
+def test_channels_take_their_time_each():
+    timing = Timing(1.0, 2.0, 0.1, 0.2, 0.3, 4.0, iterations=100, reweightings=5)
+    assert replace(timing, channels=4).total - STARTING - 1 == pytest.approx(4 * (timing.total - STARTING - 1))
+
+
 def test_dry_run_counts_the_channels(line):
     options = dict(vis=line, imagename="dry", dryrun=True, maxmem=3.0, **FAST)
     one = tsara(nchan=1, **GRID, **options)["forecast"]
     many = tsara(nchan=4, start=0, **GRID, **options)["forecast"]
     assert many["nchan"] == 4 and many["fits"]
-    single = many["seconds"]["total"] - many["seconds"]["reading"]
-    assert single > 2 * (one["seconds"]["total"] - one["seconds"]["reading"])
+    seconds = many["seconds"]
+    assert seconds["total"] - seconds["reading"] > 4 * (seconds["building"] + seconds["writing"])
     assert many["memory_bytes"]["writing"]["cubes"] == 4 * one["memory_bytes"]["writing"]["cubes"]
     huge = tsara(**GRID | dict(imsize=2048), nchan=100, start="1.42GHz", **options)["forecast"]
     assert not huge["fits"] and "nchan up to" in huge["reason"]
