@@ -40,7 +40,7 @@ class Tally:
 
 @dataclass
 class Channel:
-    """One channel: its frequency in the frame of the axis, and what was found; a blank one has neither result nor beam."""
+    """One channel: its frequency in the frame of the axis, and what was found; a blank one has no result, no beam."""
 
     freq_hz: float
     result: Result | None = None
@@ -85,8 +85,12 @@ class _Request:
 
 
 def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-              output: Output, record: Callable[[CubeResult], dict] | None = None, limits: Limits = Limits()) -> CubeResult:
-    """Image a selection of MeasurementSets channel by channel and write the products; see :func:`casa_sara.imaging.make_image`."""
+              output: Output, record: Callable[[CubeResult], dict] | None = None,
+              limits: Limits = Limits()) -> CubeResult:
+    """Image a selection of MeasurementSets channel by channel, and write the products.
+
+    Parameters and errors as of :func:`casa_sara.imaging.make_image`.
+    """
     deadline, (forecast, _) = Deadline(limits.maxtime_s), foresee(selection, grid, options, limits)
     forecast.require(limits.maxmem_gb)
     checkpoint = CubeCheckpoint(checkpoint_of(selection, grid, options, output))
@@ -109,7 +113,8 @@ def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, optio
         deadline.reserve = cube.plane.channels * writing_seconds(0, grid.shape) + writing_seconds(data.size, (0,))
         stopped = _solve_channels(cube, checkpoint, deadline)
     # write
-    result = CubeResult(Tally(data.size, data.dropped, tuple(data.notes)), cube.channels, cube.axis.frame, forecast.summary(), stopped)
+    tally = Tally(data.size, data.dropped, tuple(data.notes))
+    result = CubeResult(tally, cube.channels, cube.axis.frame, forecast.summary(), stopped)
     with waiting_child() as child:
         write_products(output, cube.plane, cube.images, [channel.sumwt for channel in cube.channels], cube.beams(),
                        record and record(result), child)
@@ -165,10 +170,12 @@ class _Cube:
         first = np.searchsorted(channel[order], np.arange(axis.size + 1))
         blank = np.diff(first) == 0
         if blank.all():
-            raise ValueError(f"start = {request.grid.start!r}, width = {request.grid.width!r}, nchan = {request.grid.nchan}: "
-                             "no sample that can be used is in these channels")
+            grid = request.grid
+            raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no sample that "
+                             "can be used is in these channels")
         if blank.any():
-            data.notes.append(f"channels {', '.join(map(str, np.flatnonzero(blank)))} are blank: no sample that can be used")
+            numbers = ", ".join(map(str, np.flatnonzero(blank)))
+            data.notes.append(f"channels {numbers} are blank: no sample that can be used")
         if first[0]:
             log.info(f"{first[0]} samples are in none of the {axis.size} channels")
         plane = replace(plane, mask=plane.mask & ~blank[:, None, None])
@@ -198,8 +205,8 @@ class _Cube:
         log.info(f"solving channel {k} of {self.axis.size}")
         part, request = self._split(k), self.request
         watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations))
-        return solve_image(part.data, part.offsets, part.noise, None, request.grid, request.options, self._startmodel(k),
-                           checkpoint, watch)
+        return solve_image(part.data, part.offsets, part.noise, None, request.grid, request.options,
+                           self._startmodel(k), checkpoint, watch)
 
     def take(self, k, reconstruction):
         """Make the images of a channel from its solution."""
@@ -222,7 +229,8 @@ class _Cube:
 
     def _fill(self, k, data, blocks, noise, reconstruction, model):
         request, channel = self.request, self.channels[k]
-        found = plane_images(data, model, request.selection, request.grid, request.weighting, request.options, self.plane)
+        found = plane_images(data, model, request.selection, request.grid, request.weighting, request.options,
+                             self.plane)
         for name, pixels in found.pixels.items():
             self.images[name][k] = pixels
         channel.sumwt, channel.beam = found.sumwt, found.beam

@@ -42,7 +42,7 @@ class CubeCheckpoint:
         if self.file.state is None:
             return
         with self.file.applied() as state:
-            self.finished = {int(channel): _reconstruction(of_channel) for channel, of_channel in state["finished"].items()}
+            self.finished = {int(channel): _reconstruction(one) for channel, one in state["finished"].items()}
             self._channel, self._solution = state["channel"], state["solution"]
 
     def of(self, channel):
@@ -57,7 +57,8 @@ class CubeCheckpoint:
     def keep(self, channel, make_solution, iteration, now=False):
         """Write the finished channels, and the state of the solution of another, when it is time or `now`."""
         def state():
-            finished = {str(number): vars(one) | dict(record=one.record.state()) for number, one in self.finished.items()}
+            finished = {str(number): vars(one) | dict(record=one.record.state())
+                        for number, one in self.finished.items()}
             return dict(finished=finished, channel=channel, solution=make_solution())
 
         self.file.keep(state, iteration, now)

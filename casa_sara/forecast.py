@@ -78,7 +78,8 @@ class Workload:
         writing = one.pop("writing")
         held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
                 "cubes": self._planes((PLANE + CUBES) * self.channels)}
-        reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples, "while reading": READING * self.samples}
+        reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples,
+                   "while reading": READING * self.samples}
         return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
                 "images of a channel": writing | held,
                 "writing": {"libraries": LIBRARIES, **held,
@@ -204,9 +205,9 @@ class Forecast:
         least = self.resident + self.needed
         limit = f"maxmem = {maxmem_gb:g} GB" if maxmem_gb else "the memory available"
         raise MemoryError(
-            f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of vis takes "
-            f"{least / 1e9:.2f} GB while {self.peak_phase} ({parts}, held now {self.resident / 1e9:.2f}); {limit} "
-            f"allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
+            f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of "
+            f"vis takes {least / 1e9:.2f} GB while {self.peak_phase} ({parts}, held now {self.resident / 1e9:.2f}); "
+            f"{limit} allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
 
     def _what_fits(self):
         """The largest image of this shape, and the most visibilities."""
@@ -223,7 +224,8 @@ class Forecast:
         ways = []
         if part:
             ways.append(f"imsize up to {list(scaled(part).shape)}")
-        channels = int(work.channels * _largest(lambda x: needs(replace(work, channels=max(1, int(work.channels * x))))))
+        fewer = _largest(lambda x: needs(replace(work, channels=max(1, int(work.channels * x)))))
+        channels = int(work.channels * fewer)
         if channels:
             ways.append(f"nchan up to {channels}")
         if samples:

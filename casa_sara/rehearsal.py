@@ -58,14 +58,15 @@ def foresee(selection, grid, options, limits, comm=SERIAL):
 
 
 def _channels(selection, grid):
-    """Return how many channels a cube will have, and the share of the samples that is in the one with most; else 0, 1."""
+    """Return how many channels a cube will have, and the share of the samples in the one with most; else 0 and 1."""
     if not grid.is_cube:
         return 0, 1.0
     axis = spectral_axis(selection, grid)
     samples = samples_of_channels(selection, axis)
     everything = sum(group.rows.size * group.channels.size for ms in select_data(selection)[0] for group in ms.groups)
     if not samples.any():
-        raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no data are in these channels")
+        raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no data are in these "
+                         "channels")
     return axis.size, float(samples.max() / everything)
 
 

@@ -27,8 +27,8 @@ ROOMS = {
     "tasks": {"casa_sara.private"},
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
     "private": {
-        "casa_sara", "casa_sara.cube", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal", "casa_sara.resources",
-        "casa_sara.solver",
+        "casa_sara", "casa_sara.cube", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal",
+        "casa_sara.resources", "casa_sara.solver",
         "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
     },
     "interrupt": set(),
@@ -53,7 +53,9 @@ ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["forecast"] = {"casa_sara.operators"}
 ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
-ROOMS["rehearsal"] = {"numpy", "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", *NUMERICS}
+ROOMS["rehearsal"] = {
+    "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", "numpy", *NUMERICS,
+}
 ROOMS["solving"] = {
     "casa_sara", "casa_sara.casa", "casa_sara.deadline", "casa_sara.interrupt", "casa_sara.timing", "numpy", *NUMERICS,
 }

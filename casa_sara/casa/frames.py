@@ -202,7 +202,7 @@ class Geometry:
         self.freq_range_hz[1] = max(self.freq_range_hz[1], float(high * factors.max()))
 
     def lsrk_factors(self, frame, field, time):
-        """Return LSRK frequency / frequency in `frame` for every row, of which field and time (MJD seconds) are given."""
+        """Return LSRK frequency / frequency in `frame` for every row; `time` in MJD seconds."""
         factors = np.ones(time.size)
         if frame in ("LSRK", "REST", "Undefined"):
             return factors

@@ -96,7 +96,8 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
             csys, miscinfo = ia.coordsys().torecord(), ia.miscinfo()
         with opened("table", root + ".pb") as tb:
             imageinfo = tb.getkeyword("imageinfo")
-    pb /= np.maximum(pb.max(axis=(-2, -1), keepdims=True), np.float32(1))  # above 1 where several fields are imaged together
+    # above 1 where several fields are imaged together
+    pb /= np.maximum(pb.max(axis=(-2, -1), keepdims=True), np.float32(1))
     mask = pb > abs(pblimit)
     pb[~mask] = 0
     kept = {key: miscinfo[key] for key in ("INSTRUME", "distance") if key in miscinfo}

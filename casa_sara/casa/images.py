@@ -15,7 +15,7 @@ __all__ = ["read_model", "write_image"]
 
 
 def write_image(name, pixels, plane, unit="", beam=None, masked=False):
-    """Write an image, of one plane or one for each channel, with the axes right ascension, declination, Stokes and frequency.
+    """Write an image of one channel or more with the axes right ascension, declination, Stokes and frequency.
 
     Parameters
     ----------

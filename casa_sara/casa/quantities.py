@@ -59,7 +59,7 @@ def hertz(text, parameter):
 
 
 def check_spectral(text, parameter):
-    """Return 'Hz' or 'km/s', whichever fits a frequency or velocity as '1.42GHz' or '-10km/s'; raise ValueError for others."""
+    """Return 'Hz' for a frequency as '1.42GHz', 'km/s' for a velocity as '-10km/s'; raise ValueError for others."""
     for unit in ("Hz", "km/s"):
         if _is(text, unit):
             return unit

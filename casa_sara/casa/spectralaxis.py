@@ -1,8 +1,8 @@
 """The spectral axis of a cube, which is tclean's, and the channel of the image that each sample belongs to.
 
 CASA's synthesisimager lays the axis out, so it is tclean's by construction. Each sample goes whole to the channel whose
-range holds its frequency in the frame of the axis: tclean's interpolation = 'nearest'. As there, the frequency of a sample
-is followed in time to LSRK, and goes from LSRK to the frame of the axis at the date of the image.
+range holds its frequency in the frame of the axis: tclean's interpolation = 'nearest'. As there, the frequency of a
+sample is followed in time to LSRK, and goes from LSRK to the frame of the axis at the date of the image.
 """
 
 from __future__ import annotations
@@ -106,12 +106,12 @@ def check_axis(grid):
     if isinstance(grid.start, int) and grid.start < 0:
         raise ValueError(f"start = {grid.start}: channels of the data begin with 0")
     if grid.width == 0:
-        raise ValueError(f"width = {grid.width}: should be the data channels in one of the image, negative for the other order")
+        raise ValueError(f"width = {grid.width}: should be how many data channels make one, negative for falling order")
     kinds = [type(value) if isinstance(value, int) else check_spectral(value, name)
              for name, value in (("start", grid.start), ("width", grid.width)) if value != ""]
     if len(set(kinds)) > 1:
-        raise ValueError(f"start = {grid.start!r} and width = {grid.width!r}: should both be channels, both frequencies, or "
-                         "both velocities")
+        raise ValueError(f"start = {grid.start!r} and width = {grid.width!r}: should both be channels, both "
+                         "frequencies, or both velocities")
 
 
 @dataclass(frozen=True)
@@ -136,12 +136,13 @@ def spectral_axis(selection, grid):
     last = max(int(group.channels.max()) for ms in selected for group in ms.groups)
     if isinstance(grid.start, int) and grid.start > last:
         raise ValueError(f"start = {grid.start}: the last channel that is selected is {last}")
-    origin = _Origin(tuple(selection.vis), {ms.number: () for ms in selected}, image_direction(grid.phasecenter, selected))
+    spws = {ms.number: () for ms in selected}
+    origin = _Origin(tuple(selection.vis), spws, image_direction(grid.phasecenter, selected))
     return SpectralAxis.of(define_image_plane(origin, selection, replace(grid, shape=_SHAPE)))
 
 
 def samples_of_channels(selection, axis):
-    """Return about how many samples each channel will have, int (nchan,): flagged ones count, and the Earth stands still."""
+    """Return about how many samples each channel will have, int (nchan,): with flagged ones, and a resting Earth."""
     count = np.zeros(axis.size + 1, int)  # the last one is for what falls into none
     for ms in select_data(selection)[0]:
         geometry = Geometry(ms, next(iter(ms.fields.values())))

@@ -3,9 +3,9 @@
 Both count the summed natural weight of the samples in each cell of the uv plane, of side
 1/(n·cell) for an image of n pixels; a sample counts at (u, v) and at (−u, −v). The index of
 a cell is trunc(n·cell·u + n//2) in single precision, where u is in metres times the rounded
-wave number; index 0 and what lies beyond the grid are left out. tclean takes −u for u, LSRK frequencies and the image's size in each axis,
-and for the channels of a cube it rounds where it truncates otherwise;
-imager takes the frequencies of the data and one size for both axes. Neither turns the
+wave number; index 0 and what lies beyond the grid are left out. tclean takes −u for u, LSRK
+frequencies and the image's size in each axis, and for the channels of a cube it rounds where it
+truncates otherwise; imager takes the frequencies of the data and one size for both axes. Neither turns the
 baselines to the phase centre of the image before it counts. Both also count what they do not
 image, autocorrelations and rows flagged by FLAG_ROW alone; here these are left out.
 """

@@ -73,7 +73,7 @@ def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
     minor, ends, done = {}, [], 0
     for number, channel in enumerate(result.channels):
         if channel.result:
-            minor[number] = {0: _minor(channel.result)}
+            minor[number] = {0: _minor(channel.result, _stop_code(channel, result))}
             ends += [done + end for end in minor[number][0]["iterDone"]]
             done = ends[-1] if ends else 0
     return {
@@ -92,19 +92,25 @@ def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
             "nthreads": options.nthreads,
             "forecast": dict(result.forecast),
             "outframe": result.frame,
-            "channels": [_channel(channel, options, full) for channel in result.channels],
+            "channels": [_channel(channel, _stop_code(channel, result), options, full) for channel in result.channels],
         },
     }
 
 
-def _channel(channel, options, full):
+def _stop_code(channel, cube):
+    """Return the stop code of a channel: of one that was not solved, what stopped the run before it."""
+    solved = channel.result and channel.result.reconstruction
+    return solved.record.stop_code if solved else cube.stopped or ITERATION_LIMIT
+
+
+def _channel(channel, code, options, full):
     """Return the record of one channel."""
     entry = {"frequency_hz": channel.freq_hz, "sumwt": channel.sumwt, "blank": channel.result is None}
     if channel.result is None:
         return entry
     result = channel.result
-    code = result.reconstruction.record.stop_code if result.reconstruction else ITERATION_LIMIT
-    beam = {axis: f"{channel.beam[axis]['value']:.9g}{channel.beam[axis]['unit']}" for axis in ("major", "minor", "positionangle")}
+    axes = {name: channel.beam[name] for name in ("major", "minor", "positionangle")}
+    beam = {name: f"{axis['value']:.9g}{axis['unit']}" for name, axis in axes.items()}
     entry |= {"visibilities": result.data.size, "dropped": dict(result.data.dropped), "beam": beam, "stopcode": code,
               "stopDescription": STOP_DESCRIPTIONS[code],
               "blocks": [_block(result, j) for j in range(len(result.blocks))]}
@@ -119,11 +125,10 @@ def _ends(result):
     return [update["iteration"] for update in record.reweightings] + [record.iteration[-1]]
 
 
-def _minor(result):
-    """Return tclean's entry of one plane in `summaryminor`."""
-    solved = result.reconstruction
+def _minor(result, code):
+    """Return tclean's entry of one channel in `summaryminor`, and its stop code."""
     return {"iterDone": _ends(result), "peakRes": [result.residual_peak], "modelFlux": [result.model_flux],
-            "stopCode": solved.record.stop_code if solved else ITERATION_LIMIT}
+            "stopCode": code}
 
 
 def _sara(result, options, full):

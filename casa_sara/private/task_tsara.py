@@ -148,8 +148,8 @@ def _refuse_for_cubes(parameters):
     if parameters["specmode"] != "cube":
         return
     if parameters["savemodel"] != "none":
-        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written from "
-                         "continuum images only; should be 'none'")
+        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written "
+                         "from continuum images only; should be 'none'")
     if parameters["parallel"]:
         raise ValueError("parallel = True with specmode = 'cube': several processes share one continuum image; should be "
                          "False, with channels shared among runs by start and nchan")
@@ -159,8 +159,8 @@ def _refuse_for_cubes(parameters):
         raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': masks "
                          "are of continuum images only; should be usemask = 'user', mask = ''")
     if parameters["npixels"]:
-        raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': the uv cell of a channel is that of the "
-                         "image; should be 0")
+        raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': the uv cell of a channel is that "
+                         "of the image; should be 0")
     if parameters["report"]:
         raise ValueError("report = True with specmode = 'cube': the report is of one image; should be False")
 
