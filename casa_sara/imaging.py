@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
 from casa_sara.casa import log
+from casa_sara.casa.blockwords import divide
 from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
@@ -18,7 +19,7 @@ from casa_sara.casa.restore import fit_beam
 from casa_sara.casa.support import read_support
 from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
-from casa_sara.cautions import check_confined, left_outside, thermal_noise
+from casa_sara.cautions import beyond_baselines, check_confined, left_outside, named_suspects, suspects, thermal_noise
 from casa_sara.deadline import Deadline
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import MeasurementOperator, check_cell, check_field
@@ -28,7 +29,7 @@ from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import UNFINISHED
 from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
-from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sort_into_blocks
+from casa_sara.visibilities import BlockInfo, Visibilities, sort_into_blocks
 
 __all__ = ["Result", "make_image", "write_column"]
 
@@ -44,7 +45,8 @@ class Result:
     """What one run found, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
-    from the data, in units of what the weights say; `forecast` is what was said of memory and time before.
+    from the data, in units of what the weights say; `forecast` is what was said of memory and time before; `suspects`
+    are the blocks of :func:`casa_sara.cautions.suspects`.
     """
 
     data: Visibilities
@@ -54,6 +56,7 @@ class Result:
     residual_peak: float
     model_flux: float
     forecast: dict
+    suspects: list = field(default_factory=list)
 
     @property
     def finished(self) -> bool:
@@ -101,7 +104,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if support is not None and start is not None:
         start *= support
     # split and weigh
-    block_of_sample, blocks = snapshot_blocks(data, output.blocks)
+    block_of_sample, blocks = divide(data, output.blocks)
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise = noise_from_differences(data, offsets)
     _describe(data, blocks, noise, grid.stokes)
@@ -116,16 +119,20 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         model = reconstruction.model
         data, blocks = without_wild(data, blocks, offsets, reconstruction)
+    doubtful = suspects(blocks, noise, reconstruction.l2_bounds) if reconstruction else []
+    for line in named_suspects(blocks, doubtful):
+        log.warn(line)
     # write
     with waiting_child() as child:  # which starts meanwhile
         weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane)
         residual = dirty_image(operator, data.vis - operator.forward(model), weights)
+        _caution(data, beyond_baselines(model, grid.cell_rad, data.uvw[:2]))
         images = dict(psf=psf, residual=residual, model=model)
         if support is not None:
             images["mask"] = check_confined(model, support)
             _caution(data, left_outside(residual, support, thermal_noise(data, weights, noise, blocks)))
         result = Result(data, blocks, noise, reconstruction, float(np.abs(residual).max()),
-                        float(model.sum(dtype=float)), forecast.summary())
+                        float(model.sum(dtype=float)), forecast.summary(), doubtful)
         write_products(output, plane, images, sum_of_weights(data, selection, weights, grid.stokes), beam, record and record(result),
                        child)
     if result.finished or not checkpoint.stands:  # else one of an older run

@@ -6,13 +6,14 @@ import math
 import time
 
 from casa_sara.casa import log
+from casa_sara.casa.blockwords import divide
 from casa_sara.casa.census import take_census
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.forecast import Workload, forecast
 from casa_sara.operators.measurement import check_field
 from casa_sara.resources import available_memory, resident_memory
 from casa_sara.timing import measure
-from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
+from casa_sara.visibilities import sort_into_blocks
 
 __all__ = ["foresee", "rehearse"]
 
@@ -49,7 +50,7 @@ def rehearse(selection, grid, options, blocks, limits):
     ----------
     selection, grid, options
         As of :func:`casa_sara.imaging.make_image`.
-    blocks : int
+    blocks : int or tuple of str
         As of :class:`casa_sara.options.Output`.
     limits : casa_sara.options.Limits
 
@@ -68,7 +69,7 @@ def rehearse(selection, grid, options, blocks, limits):
             return found.summary() | {"reason": str(error)}
     start = time.perf_counter()
     data = read_visibilities(selection, grid.phasecenter, grid.stokes)
-    data, offsets = sort_into_blocks(data, snapshot_blocks(data, blocks)[0])
+    data, offsets = sort_into_blocks(data, divide(data, blocks)[0])
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
     for line in _time_lines(timing):
         log.info(line)

@@ -131,7 +131,7 @@ def clock(mjd_seconds):
     return str(np.datetime64("1858-11-17T00:00:00") + np.timedelta64(round(mjd_seconds), "s"))
 
 
-def snapshot_blocks(visibilities, blocks=0):
+def snapshot_blocks(visibilities, blocks=0, group=None):
     """Split the samples into snapshots: spans over which errors may be taken as constant.
 
     Each block gets an ℓ2 bound of its own. The automatic rule (`blocks` = 0):
@@ -151,11 +151,13 @@ def snapshot_blocks(visibilities, blocks=0):
     visibilities : Visibilities
     blocks : int
         0 for the automatic rule, or the number of blocks.
+    group : int (M,), optional
+        Samples of different groups are never in one block; the automatic rule splits each group by itself.
 
     Returns
     -------
     block_of_sample : int32 (M,)
-        Numbers 0 … d−1 along MeasurementSets and time; every block holds a sample.
+        Numbers 0 … d−1 along groups, MeasurementSets and time; every block holds a sample.
     infos : list of d BlockInfo
 
     Raises
@@ -167,11 +169,25 @@ def snapshot_blocks(visibilities, blocks=0):
         raise ValueError(
             f"blocks = {blocks}: it takes 0 (automatic) or 1 to {visibilities.size}, the number of visibilities"
         )
-    if blocks:
+    if group is not None:
+        block_of_sample = _blocks_of_groups(visibilities, group)
+    elif blocks:
         block_of_sample = _equal_blocks(visibilities, blocks)
     else:
         block_of_sample = _blocks_of_rows(visibilities)[visibilities.row]
     return block_of_sample, _block_infos(visibilities, block_of_sample)
+
+
+def _blocks_of_groups(visibilities, group):
+    """Return the block int32 (M,) of every sample by the automatic rule in each group."""
+    block_of_sample, blocks = np.empty(visibilities.size, np.int32), 0
+    for number in np.unique(group):
+        here = group == number
+        used, row = np.unique(visibilities.row[here], return_inverse=True)
+        rows = RowTable(**{name: getattr(visibilities.rows, name)[used] for name in RowTable.__dataclass_fields__})
+        block_of_sample[here] = blocks + _blocks_of_rows(replace(visibilities, rows=rows, row=row))[row]
+        blocks = int(block_of_sample[here].max()) + 1
+    return block_of_sample
 
 
 def _equal_blocks(visibilities, blocks):

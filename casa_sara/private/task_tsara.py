@@ -10,6 +10,7 @@ from typing import Any
 import casa_sara
 from casa_sara.analysis import folder
 from casa_sara.casa import log
+from casa_sara.casa.blockwords import parsed
 from casa_sara.casa.lock import one_run_of
 from casa_sara.casa.modelcolumn import check_model_column_writable, incomplete_columns
 from casa_sara.casa.products import (
@@ -39,7 +40,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     options = _solver_options(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"]:
-        return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
+        return {"forecast": rehearse(selection, grid, options, _blocks(parameters), limits)}
     check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked)
     with one_run_of(parameters["imagename"]):
         recover_products(parameters["imagename"])
@@ -101,6 +102,17 @@ def _check_stokes(parameters):
                                 ("report", False, "a report is of Stokes I")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = {right!r}")
+
+
+def _blocks(parameters):
+    """The number of blocks, or the entries that name some of them."""
+    blocks = parameters["blocks"]
+    if isinstance(blocks, int):
+        return blocks
+    entries = (blocks,) if isinstance(blocks, str) else tuple(blocks)
+    for entry in entries or ("",):
+        parsed(entry)
+    return entries
 
 
 def _mask(parameters):
@@ -174,7 +186,7 @@ def _output(parameters):
         raise FileExistsError(f"imagename = '{imagename}': {', '.join(old)} exist; choose another name, "
                               "overwrite = True to replace them, or restart = True to continue from the model")
     beam = tuple(restoring_beam_words(parameters["restoringbeam"])) if parameters["restoration"] else None
-    return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"], images_stand,
+    return Output(imagename, startmodel, _blocks(parameters), beam, parameters["savemodel"], images_stand,
                   tuple(history_lines("tsara", parameters)), parameters["restart"] and unfinished,
                   parameters["pblimit"], parameters["pbcor"])
 
