@@ -208,9 +208,10 @@ class _tsara:
         Only SIN: the projection in which an interferometer sees the sky.
 
     startmodel : str, default ''
-        An image in Jy/pixel to start from, for instance a CLEAN model of the same field. It is
-        regridded to the new image where the two differ. It changes how long the solver takes, not
-        what it converges to.
+        An image in Jy/pixel to start from, on any grid: it is regridded with its flux kept. Where the
+        data decide, it changes how long the solver takes, not what it converges to. Where they do
+        not, the solution keeps much of it: so an image of a single dish or of a smaller array, in
+        Jy/pixel, gives the extended flux that the shortest baselines lack.
         Example: startmodel='first.model'
 
     specmode : {'mfs'}, default 'mfs'
