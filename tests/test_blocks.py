@@ -22,7 +22,7 @@ def vis(tmp_path_factory):
     """Two MeasurementSets; of scan 2 of the first, the second half is ten times noisier than its weights say."""
     folder = tmp_path_factory.mktemp("ms")
     names = [simulate(folder / f"{number}.ms", configuration="c", antennas=14, scans=3, integration=10.0, noise=NOISE,
-                      scan_seconds=120.0, spws=(("8.4GHz", "2MHz", 1), ("8.5GHz", "2MHz", 1)), hour_angle=-1.0 - number,
+                      scan_seconds=120.0, spws=(("8.4GHz", "2MHz", 2), ("8.5GHz", "2MHz", 2)), hour_angle=-1.0 - number,
                       sky=[(0.2, 6 * CELL_RAD, 4 * CELL_RAD)], seed=number, fields=(CYGNUS_A,)) for number in range(2)]
     rng, bad = np.random.default_rng(9), _bad(names[0])
     edit(names[0], "DATA", lambda data: data + bad * NOISE * np.sqrt(WORSE**2 - 1) * (
@@ -51,13 +51,14 @@ def read(vis):
     (("scan=3",), lambda rows: [rows["scan"] == 3]),
     (("vis=1 scan=1,3",), lambda rows: [(rows["ms"] == 1) & (rows["scan"] != 2)]),
     (("spw=1", "scan=2"), lambda rows: [rows["spw"] == 1, (rows["spw"] == 0) & (rows["scan"] == 2)]),
+    (("spw=0:1 vis=1",), lambda rows: [(rows["ms"] == 1) & (rows["spw"] == 0) & (rows["chan"] == 1)]),
     (("vis=0", "antenna=A03"), lambda rows: [rows["ms"] == 0, (rows["ms"] == 1) & ((rows["one"] == 3) | (rows["two"] == 3))]),
 ])
 def test_entries_set_apart_what_they_name(vis, entries, expected):
     data = read(vis)
     table = data.rows
     rows = {name: values[data.row] for name, values in dict(
-        ms=table.ms, scan=table.scan, spw=table.spw, one=table.antenna1, two=table.antenna2).items()}
+        ms=table.ms, scan=table.scan, spw=table.spw, one=table.antenna1, two=table.antenna2).items()} | dict(chan=data.chan)
     block, infos = divide(data, entries)
     apart = expected(rows)
     for named in (*apart, ~np.any(apart, axis=0)):

@@ -208,10 +208,10 @@ class _tsara:
         Only SIN: the projection in which an interferometer sees the sky.
 
     startmodel : str, default ''
-        An image in Jy/pixel to start from, on any grid: it is regridded with its flux kept. Where the
-        data decide, it changes how long the solver takes, not what it converges to. Where they do
-        not, the solution keeps much of it: so an image of a single dish or of a smaller array, in
-        Jy/pixel, gives the extended flux that the shortest baselines lack.
+        An image in Jy/pixel to start from, on any grid: it is regridded with its flux kept. It
+        changes how long the solver takes, not what it converges to, where the data decide. On scales
+        that no baseline sees the solution keeps some of it, from a quarter to all in trials: it helps,
+        but does not assure the extended flux of a single dish. For that, feather .image afterwards.
         Example: startmodel='first.model'
 
     specmode : {'mfs'}, default 'mfs'
