@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
 from casa_sara.casa import log
+from casa_sara.casa.blockwords import divide
 from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
@@ -20,7 +21,7 @@ from casa_sara.casa.spectrum import with_spectrum
 from casa_sara.casa.support import read_support
 from casa_sara.casa.tools import opened
 from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
-from casa_sara.cautions import check_confined, left_outside, thermal_noise
+from casa_sara.cautions import beyond_baselines, check_confined, left_outside, named_suspects, suspects, thermal_noise
 from casa_sara.deadline import Deadline
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.measurement import Summed, check_cell, check_field
@@ -33,7 +34,7 @@ from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import UNFINISHED
 from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
-from casa_sara.visibilities import BlockInfo, Visibilities, snapshot_blocks, sort_into_blocks
+from casa_sara.visibilities import BlockInfo, Visibilities, sort_into_blocks
 
 __all__ = [
     "PlaneImages", "Result", "Split", "describe", "image_limits", "make_image", "plane_images", "split", "write_column",
@@ -51,8 +52,9 @@ class Result:
     """What one run found, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
-    from the data, in units of what the weights say; `forecast` is what was said of memory and time before. Of several
-    ranks each has its own samples in `data`; `size` is the number of all.
+    from the data, in units of what the weights say; `forecast` is what was said of memory and time before; `suspects`
+    are the blocks of :func:`casa_sara.cautions.suspects`. Of several ranks each has its own samples in `data`; `size` is
+    the number of all.
     """
 
     data: Visibilities
@@ -63,6 +65,7 @@ class Result:
     residual_peak: float
     model_flux: float
     forecast: dict
+    suspects: list = field(default_factory=list)
 
     @property
     def finished(self) -> bool:
@@ -161,15 +164,19 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         model = reconstruction.model
         data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
         offsets = np.searchsorted(reconstruction.kept, offsets)
+    doubtful = suspects(blocks, noise, reconstruction.l2_bounds) if reconstruction else []
+    for line in named_suspects(blocks, doubtful):
+        log.warn(line)
     # write
     with waiting_child() if comm.rank == 0 else nullcontext() as child:  # which starts meanwhile
         images = plane_images(data, model, selection, grid, weighting, options, plane, comm)
+        _caution(data, beyond_baselines(model, grid.cell_rad, -comm.largest(-data.min_uv)))
         if support is not None:
             images.pixels["mask"] = check_confined(model, support)
             sigma = thermal_noise(data, images.weights, noise, offsets, comm)
             _caution(data, left_outside(images.pixels["residual"], support, sigma))
         result = Result(data, comm.total(data.size), blocks, noise, reconstruction, images.residual_peak, images.model_flux,
-                        forecast.summary())
+                        forecast.summary(), doubtful)
         comm.once(write_products, output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
     if comm.broadcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
@@ -180,7 +187,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
 
 def split(data, blocks, comm=SERIAL):
     """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`)."""
-    block_of_sample, infos = snapshot_blocks(data, blocks, comm)
+    block_of_sample, infos = divide(data, blocks, comm)
     data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
     noise = noise_from_differences(data, offsets, comm)
     return Split(data, infos, offsets, noise)

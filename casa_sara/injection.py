@@ -9,6 +9,7 @@ import numpy as np
 
 from casa_sara.analysis.points import recovered_point
 from casa_sara.casa import log
+from casa_sara.casa.blockwords import divide
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.casa.regrid import PixelMap
 from casa_sara.casa.skyimage import SkyPlane
@@ -17,7 +18,7 @@ from casa_sara.noise import noise_from_differences
 from casa_sara.options import ImageGrid, Selection, SolverOptions
 from casa_sara.solver.record import STOPPED_BY_USER
 from casa_sara.solving import solve_image
-from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
+from casa_sara.visibilities import sort_into_blocks
 
 __all__ = ["Injection", "can_be_repeated", "recover", "spectral_index_of"]
 
@@ -38,8 +39,9 @@ class Injection:
 
 
 def can_be_repeated(one) -> bool:
-    """Tell whether the run that made an ImageSet can be repeated: it is tsara's, and the images say with what."""
-    return one.parameters.get("taskname") == "tsara"
+    """Tell whether the run that made an ImageSet can be repeated: it is tsara's without a mask, and the images say with what."""
+    masked = one.parameters.get("usemask", "user") != "user" or one.parameters.get("mask", "") not in ("", "[]", "['']")
+    return one.parameters.get("taskname") == "tsara" and not masked
 
 
 def spectral_index_of(one) -> str:
@@ -103,7 +105,7 @@ def _repeat(one, places, flux, selection, nthreads):
                      gridder=one.parameters.get("gridder", "standard"), spectralindex=spectral_index_of(one))
     grid = with_spectrum(grid, plane)
     data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
-    block_of_sample, _ = snapshot_blocks(data, _value(one.parameters.get("blocks", "0"), 0))
+    block_of_sample, _ = divide(data, _blocks(one.parameters.get("blocks", "0")))
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise, options = noise_from_differences(data, offsets), _options(one.parameters, nthreads)
     models = []
@@ -138,6 +140,15 @@ def _options(parameters, nthreads) -> SolverOptions:
     given = {field.name: _value(parameters[field.name], field.default)
              for field in fields(SolverOptions) if field.name in parameters}
     return SolverOptions(**given | {"nthreads": nthreads})
+
+
+def _blocks(text):
+    """Return the blocks as they are spelt in a history: a number, a list of entries, or one."""
+    try:
+        blocks = ast.literal_eval(text)
+    except (SyntaxError, ValueError):
+        blocks = text
+    return blocks if isinstance(blocks, int) else (blocks,) if isinstance(blocks, str) else tuple(blocks)
 
 
 def _value(text, default):

@@ -133,13 +133,13 @@ class Output:
     """Where results go, and what goes along.
 
     `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image;
-    `resume` says to go on from the checkpoint. `pbcor` asks for the images divided by the primary beam. With `images_stand` the products of an earlier run stay as they are, and
-    only the model column is written.
+    `resume` says to go on from the checkpoint. `pbcor` asks for the images divided by the primary beam. With `images_stand`
+    the products of an earlier run stay as they are, and only the model column is written.
     """
 
     imagename: str
     startmodel: str = ""
-    blocks: int = 0
+    blocks: int | tuple[str, ...] = 0
     restoringbeam: tuple[str, ...] | None = ()
     savemodel: str = "none"
     images_stand: bool = False

@@ -10,6 +10,7 @@ import numpy as np
 
 from casa_sara.balance import muster
 from casa_sara.casa import log
+from casa_sara.casa.blockwords import divide
 from casa_sara.casa.census import take_census
 from casa_sara.casa.imageplane import define_image_plane
 from casa_sara.casa.ms import read_visibilities
@@ -21,7 +22,7 @@ from casa_sara.operators.measurement import check_field
 from casa_sara.resources import available_memory, resident_memory
 from casa_sara.parallel import SERIAL
 from casa_sara.timing import measure
-from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
+from casa_sara.visibilities import sort_into_blocks
 
 __all__ = ["foresee", "rehearse"]
 
@@ -86,7 +87,7 @@ def rehearse(selection, grid, options, blocks, limits):
     ----------
     selection, grid, options
         As of :func:`casa_sara.imaging.make_image`.
-    blocks : int
+    blocks : int or tuple of str
         As of :class:`casa_sara.options.Output`.
     limits : casa_sara.options.Limits
 
@@ -110,7 +111,7 @@ def rehearse(selection, grid, options, blocks, limits):
     everything = data.size
     if grid.is_cube:
         data = _fullest_channel(data, selection, grid)
-    data, offsets = sort_into_blocks(data, snapshot_blocks(data, blocks)[0])
+    data, offsets = sort_into_blocks(data, divide(data, blocks)[0])
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
     timing = replace(timing, channels=max(found.workload.channels, 1))
     for line in _time_lines(timing):

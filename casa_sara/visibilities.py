@@ -116,6 +116,11 @@ class Visibilities:
         return float(np.sqrt(np.max(self.uvw[0] ** 2 + self.uvw[1] ** 2, initial=0)))
 
     @property
+    def min_uv(self) -> float:
+        """Shortest projected baseline in wavelengths."""
+        return float(np.sqrt(np.min(self.uvw[0] ** 2 + self.uvw[1] ** 2, initial=np.inf)))
+
+    @property
     def max_w(self) -> float:
         """Largest |w| in wavelengths."""
         return float(np.max(np.abs(self.uvw[2]), initial=0))
@@ -145,7 +150,7 @@ def clock(mjd_seconds):
     return str(np.datetime64("1858-11-17T00:00:00") + np.timedelta64(round(mjd_seconds), "s"))
 
 
-def snapshot_blocks(visibilities, blocks=0, comm=SERIAL):
+def snapshot_blocks(visibilities, blocks=0, group=None, comm=SERIAL):
     """Split the samples into snapshots: spans over which errors may be taken as constant.
 
     Each block gets an ℓ2 bound of its own. The automatic rule (`blocks` = 0):
@@ -165,13 +170,15 @@ def snapshot_blocks(visibilities, blocks=0, comm=SERIAL):
     visibilities : Visibilities
     blocks : int
         0 for the automatic rule, or the number of blocks.
+    group : int (M,), optional
+        Samples of different groups are never in one block; the automatic rule splits each group by itself.
     comm : casa_sara.parallel.Serial or MPI
         Over whose ranks the samples are spread, in the order in which one rank alone has them.
 
     Returns
     -------
     block_of_sample : int32 (M,)
-        Numbers 0 … d−1 along MeasurementSets and time; every block holds a sample, on one of the ranks.
+        Numbers 0 … d−1 along groups, MeasurementSets and time; every block holds a sample, on one of the ranks.
     infos : list of d BlockInfo
 
     Raises
@@ -184,7 +191,9 @@ def snapshot_blocks(visibilities, blocks=0, comm=SERIAL):
         raise ValueError(f"blocks = {blocks}: it takes 0 (automatic) or 1 to {size}, the number of visibilities")
     table, of_row = _integrations(visibilities, comm)
     of_sample = of_row[visibilities.row]
-    if blocks:
+    if group is not None:
+        block_of_sample = _blocks_of_groups(table, of_sample, group, comm)
+    elif blocks:
         block_of_sample = _equal_blocks(table, of_sample, blocks, comm)
     else:
         block_of_sample = _blocks_of_rows(table)[of_sample]
@@ -223,6 +232,21 @@ def _distinct(columns):
     number[order] = np.concatenate([[0], np.cumsum(new)])[: order.size]
     first = order[np.concatenate([[True], new])[: order.size]]
     return [column[first] for column in columns], number
+
+
+def _blocks_of_groups(table, of_sample, group, comm):
+    """Return the block int32 (M,) of every sample by the automatic rule in each group."""
+    block_of_sample, blocks = np.empty(of_sample.size, np.int32), 0
+    for number in range(1 + int(comm.largest(int(group.max(initial=0))))):
+        here = group == number
+        samples = comm.sum(np.bincount(of_sample[here], minlength=table.time.size))
+        used = samples > 0
+        if used.any():
+            columns = {name: getattr(table, name)[used] for name in table.__dataclass_fields__}
+            of_integration = _blocks_of_rows(_Integrations(**columns | dict(samples=samples[used])))
+            block_of_sample[here] = blocks + of_integration[(np.cumsum(used) - 1)[of_sample[here]]]
+            blocks += 1 + int(of_integration.max())
+    return block_of_sample
 
 
 def _equal_blocks(table, of_sample, blocks, comm):

@@ -38,7 +38,7 @@ ROOMS = {
     "options": set(),
     "visibilities": {"numpy"},
     "noise": {"casa_sara.visibilities", "numpy"},
-    "cautions": {"casa_sara.visibilities", "numpy"},
+    "cautions": {"casa_sara.visibilities", "numpy", "scipy"},
     "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
     "casa": {"casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
     "operators": {

@@ -8,7 +8,7 @@ from simulated_ms import simulate
 casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara  # noqa: E402
-from casa_sara.cautions import check_confined, left_outside  # noqa: E402
+from casa_sara.cautions import beyond_baselines, check_confined, left_outside  # noqa: E402
 from casa_sara.solver.adaptive_ppd import AdaptivePPD  # noqa: E402
 from casa_sara.solver.l2_bounds import GivenBounds  # noqa: E402
 from casa_sara.solver.nnls import nnls  # noqa: E402
@@ -60,7 +60,7 @@ def test_mask_is_tcleans_and_the_model_is_zero_outside(vis):
 
 def test_what_is_outside_stays_out_is_pointed_out_and_raises_the_noise(vis):
     """0.4 Jy that the mask keeps out add their power to what is found as noise: √(1 + 0.4²w/2), w the weight."""
-    result = tsara(vis=vis, imagename="x", niter=200, mask="circle[[48pix,30pix],2pix]", **GRID)
+    result = tsara(vis=vis, imagename="x", niter=200, mask="circle[[48pix,30pix],2pix]", **(GRID | dict(wavelets=["dirac"])))
     model = pixels("x.model")
     assert not model[pixels("x.mask") == 0].any()
     assert model.sum() == pytest.approx(1.0, rel=0.1)
@@ -81,11 +81,11 @@ def test_what_is_outside_stays_out_is_pointed_out_and_raises_the_noise(vis):
 
 
 def _on_grid(size, cell):
-    """The mask as it is, after a look: a circle of 8 arcsec drawn anew, within a pixel of its edge."""
+    """The mask as it is, after a look: a circle of 8 arcsec, to the pixels of both grids."""
     x, y = (np.indices((size, size)) - size // 2) * cell
     near = np.hypot(x - 8, y + 6)
     theirs = pixels("z.mask") > 0
-    assert theirs[near < 8 - cell].all() and not theirs[near > 8 + cell].any()
+    assert theirs[near < 8 - cell].all() and not theirs[near > 8 + 2].any()
     return theirs
 
 
@@ -200,3 +200,55 @@ def test_a_model_outside_is_an_error_and_artefacts_are_no_news():
     assert "9.0 times its noise, at pixel [6, 1]" in left_outside(residual, support, 1.0)[0]
     residual[3, 3] = 7.0  # as large inside
     assert left_outside(residual, support, 1.0) == []
+
+
+# ---- what the shortest baseline does not see
+
+
+def gaussian(axes, shape=(96, 96), centre=(50, 45)):
+    """A Gaussian of these FWHM in pixels, of 1 Jy."""
+    x, y = (np.indices(shape) - np.reshape(centre, (2, 1, 1))) * 2.3548 / np.reshape(axes, (2, 1, 1))
+    image = np.exp(-(x**2 + y**2) / 2)
+    return image / image.sum()
+
+
+def test_a_source_that_the_shortest_baseline_cannot_see_is_pointed_out():
+    """Just above and just below 0.6 of its fringe; not for a narrow one, many small ones, or a faint one."""
+    cell, seen = (CELL_RAD, 1.25 * CELL_RAD), 0.6 / (20 * CELL_RAD)
+
+    def told(model):
+        return beyond_baselines(model, cell, seen)
+
+    (words,) = told(gaussian((24, 24 / 1.25)))
+    assert "scales up to 20 arcsec" in words and 20 < float(words.split("a source of ")[1].split(":")[0]) < 25
+    assert told(gaussian((18, 18 / 1.25))) == [] and told(-gaussian((30, 24)))
+    assert told(gaussian((40, 8))) == []
+    points = np.zeros((96, 96))
+    points[10:90:26, 10:90:26] = 1
+    assert told(points) == [] and told(np.zeros((96, 96))) == []
+    assert told(points + gaussian((26, 26))) == []  # 1 Jy of 17
+
+
+def test_a_coarse_start_model_keeps_its_flux_and_is_pointed_out(vis):
+    """An image as a single dish's, 4 arcsec a pixel and of another size, of a source that no baseline sees."""
+    common = dict(vis=vis, uvrange=">12klambda", **(GRID | dict(imsize=96)))
+    tsara(imagename="dish", niter=0, **(common | dict(imsize=40, cell="4arcsec", uvrange="<20klambda")))
+    coarse = 3 * gaussian((8, 7), (40, 40), (20, 21))
+    ia = casatools.image()
+    ia.open("dish.model")
+    ia.putchunk(coarse[:, :, None, None])
+    ia.close()
+    result = tsara(imagename="x", niter=0, startmodel="dish.model", **common)
+    model = pixels("x.model")
+    assert model.sum() == pytest.approx(3, rel=1e-3)
+    centre = [model.sum(axis=1 - axis) @ np.arange(96) / model.sum() for axis in (0, 1)]
+    assert centre == pytest.approx([48, 48 + 4], abs=0.1)
+    assert any("the shortest baseline sees scales up to" in note for note in result["sara"]["notes"])
+    assert not any("shortest baseline" in note for note in tsara(imagename="y", niter=0, **common)["sara"]["notes"])
+
+
+def test_a_start_model_in_another_unit_is_refused_with_the_way_to_the_right_one(vis):
+    tsara(vis=vis, imagename="x", niter=0, restoringbeam=["6arcsec", "4arcsec", "0deg"], **GRID)
+    pixels_in_beam = f"{np.pi / (4 * np.log(2)) * 24:.3f}"
+    with pytest.raises(ValueError, match=f"startmodel = 'x.image' is in 'Jy/beam': it takes 'Jy/pixel'; divide it by {pixels_in_beam}"):
+        tsara(vis=vis, imagename="y", niter=0, startmodel="x.image", **GRID)

@@ -8,6 +8,7 @@ import os
 import numpy as np
 
 from casa_sara.casa.imageplane import read_pixels, slabs
+from casa_sara.casa.quantities import radians
 from casa_sara.casa.regrid import PixelMap, on_plane
 from casa_sara.casa.tools import opened
 
@@ -102,7 +103,20 @@ def read_model(name, plane, channel=0):
     if stokes and stokes != list(wanted):
         raise ValueError(f"startmodel = '{name}' is of Stokes {', '.join(stokes)}: should be of {', '.join(wanted)}")
     if unit != "Jy/pixel":
-        raise ValueError(f"startmodel = '{name}' is in '{unit}': it takes 'Jy/pixel'")
+        raise ValueError(f"startmodel = '{name}' is in '{unit}': it takes 'Jy/pixel'{_conversion(name, unit)}")
     if not np.isfinite(pixels).all():
         raise ValueError(f"startmodel = '{name}' holds pixels that are not finite")
     return on_plane(pixels, PixelMap(csys, plane), plane.shape)
+
+
+def _conversion(name, unit):
+    """Say how an image in Jy/beam becomes one in Jy/pixel."""
+    if unit != "Jy/beam":
+        return ""
+    with opened("image", name) as ia:
+        beam, cell = ia.restoringbeam(), np.abs(ia.coordsys().increment()["numeric"][:2])
+    if "major" not in beam:
+        return "; divide it by the pixels in its beam, pi/(4 ln 2) times its axes over the pixel's, as immath does"
+    axes = [radians(f"{beam[axis]['value']!r}{beam[axis]['unit']}", "startmodel") for axis in ("major", "minor")]
+    pixels = np.pi / (4 * np.log(2)) * axes[0] * axes[1] / (cell[0] * cell[1])
+    return f"; divide it by {pixels:.6g}, the pixels in its beam, as immath does, and set its unit with imhead"

@@ -139,6 +139,7 @@ def _sara(result, options, full):
         "dropped": dict(data.dropped),
         "notes": list(data.notes),
         "blocks": [_block(result, j) for j in range(len(result.blocks))],
+        "suspects": [dict(suspect) for suspect in result.suspects],
         "nthreads": options.nthreads,
         "forecast": dict(result.forecast),
     }

@@ -12,6 +12,7 @@ from typing import Any
 import casa_sara
 from casa_sara.analysis import folder
 from casa_sara.casa import log
+from casa_sara.casa.blockwords import parsed
 from casa_sara.casa.lock import one_run_of
 from casa_sara.casa.modelcolumn import check_model_column_writable, incomplete_columns
 from casa_sara.casa.products import (
@@ -55,7 +56,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
         raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank stands in "
                          "the first lines of the log of the run itself, docs/parallel.md tells the time")
     if parameters["dryrun"]:
-        return {"forecast": rehearse(selection, grid, options, parameters["blocks"], limits)}
+        return {"forecast": rehearse(selection, grid, options, _blocks(parameters), limits)}
     make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
@@ -177,6 +178,17 @@ def _check_stokes(parameters):
             raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = {right!r}")
 
 
+def _blocks(parameters):
+    """The number of blocks, or the entries that name some of them."""
+    blocks = parameters["blocks"]
+    if isinstance(blocks, int):
+        return blocks
+    entries = (blocks,) if isinstance(blocks, str) else tuple(blocks)
+    for entry in entries or ("",):
+        parsed(entry)
+    return entries
+
+
 def _mask(parameters):
     """The entries of the mask."""
     mask = parameters["mask"]
@@ -254,7 +266,7 @@ def _output(parameters):
         raise FileExistsError(f"imagename = '{imagename}': {', '.join(old)} exist; choose another name, "
                               "overwrite = True to replace them, or restart = True to continue from the model")
     beam = tuple(restoring_beam_words(parameters["restoringbeam"])) if parameters["restoration"] else None
-    return Output(imagename, startmodel, parameters["blocks"], beam, parameters["savemodel"], images_stand,
+    return Output(imagename, startmodel, _blocks(parameters), beam, parameters["savemodel"], images_stand,
                   tuple(history_lines("tsara", parameters)), parameters["restart"] and unfinished,
                   parameters["pblimit"], parameters["pbcor"])
 

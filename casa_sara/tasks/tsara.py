@@ -63,7 +63,7 @@ PARAMETERS = (
     Parameter('reltol', ('double',), 0.0003, 'Relative change of the model in one iteration that counts as converged', minimum=0.0, maximum=1.0),
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
-    Parameter('blocks', ('int',), 0, 'Number of data blocks, each with its own bound; 0: one per snapshot', minimum=0.0),
+    Parameter('blocks', ('int', 'string', 'stringVec'), 0, 'Data blocks, each with its own bound: 0, one per snapshot; a number; or which data to set apart'),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0, maximum=1024.0),
     Parameter('dryrun', ('bool',), False, 'Only say what the run would take: memory and time'),
     Parameter('maxmem', ('double',), 0.0, 'Most memory to use, in GB; 0: what the machine has available', minimum=0.0),
@@ -219,9 +219,10 @@ class _tsara:
         Only SIN: the projection in which an interferometer sees the sky.
 
     startmodel : str, default ''
-        An image in Jy/pixel to start from, for instance a CLEAN model of the same field. It is
-        regridded to the new image where the two differ. It changes how long the solver takes, not
-        what it converges to.
+        An image in Jy/pixel to start from, on any grid: it is regridded with its flux kept. It
+        changes how long the solver takes, not what it converges to, where the data decide. On scales
+        that no baseline sees the solution keeps some of it, from a quarter to all in trials: it helps,
+        but does not assure the extended flux of a single dish. For that, feather .image afterwards.
         Example: startmodel='first.model'
 
     specmode : {'mfs', 'cube'}, default 'mfs'
@@ -477,10 +478,18 @@ class _tsara:
         prevail, up to 1.4 times that). Larger values give a smoother image and an emptier background,
         e.g. 2 for faint emission in a wide field; smaller ones follow the noise.
 
-    blocks : int, default 0
+    blocks : int or str or list of str, default 0
         0 makes one block of each MeasurementSet, observation and scan, and splits long scans in
         time, so that every snapshot, with its own calibration errors, finds its own noise level.
         Another number cuts the data, in the order of time, into that many blocks of about one size.
+        A list sets data apart whose noise is known to differ: each entry names some, by the words of
+        the data selection (field, spw, timerange, uvrange, antenna, scan, observation, intent) and
+        vis, the number of the MeasurementSet; several words in one entry must all hold. What an entry
+        names, and the rest, is split into snapshots each by itself; where entries overlap the first
+        has the data. An entry that names nothing is refused.
+        Examples: blocks=1
+                  blocks='scan=3'
+                  blocks=['vis=0 scan=3', 'timerange=09:14:00~09:20:00', 'spw=1', 'antenna=ea13']
 
     nthreads : int, default 0
         Threads for the Fourier and wavelet transforms; no more than the machine has cores.
