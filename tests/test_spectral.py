@@ -10,7 +10,8 @@ casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara
 from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.spectrum import spectral_band
+from casa_sara.casa.skyimage import read_sky_image
+from casa_sara.casa.spectrum import spectral_band, with_spectrum
 from casa_sara.compare import compare_images
 from casa_sara.operators.sky import further_bytes, sky_operator
 from casa_sara.options import Comparing, ImageGrid, Selection, Spectrum
@@ -170,6 +171,10 @@ def test_image_of_indices(run, vis, tmp_path):
     name = str(tmp_path / "image")
     tsara(vis=vis, imagename=name, spectralindex=alpha(str(tmp_path / "a.alpha"), values, mask, run), **GRID)
     np.testing.assert_allclose(fluxes(name), fluxes(run[1]), rtol=2e-3)
+    plane = read_sky_image(run[1] + ".model", "models", None).plane
+    spectrum = with_spectrum(ImageGrid((64, 64), (PIXEL, PIXEL), spectralindex=str(tmp_path / "a.alpha")), plane).spectrum
+    assert spectrum.reference_hz == REFERENCE and spectrum.index[0, 0] == pytest.approx(0.5)
+    assert np.all(spectrum.index.reshape(-1)[1:] == np.float32(INDEX))
     said = tsara(vis=vis, imagename=name, spectralindex=str(tmp_path / "a.alpha"), dryrun=True, **GRID)["forecast"]
     plain = tsara(vis=vis, imagename=name, spectralindex=INDEX, dryrun=True, **GRID)["forecast"]
     assert said["memory_bytes"]["iterating"]["operator"] > plain["memory_bytes"]["iterating"]["operator"]

@@ -16,6 +16,7 @@ from casa_sara import tsara
 from casa_sara.casa.census import take_census
 from casa_sara.casa.ms import read_visibilities
 from casa_sara.compare import compare_images
+from casa_sara.operators import widefield
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
 from casa_sara.operators.sky import further_bytes
 from casa_sara.operators.widefield import MOST_TERMS, WGridder, WTerm, w_operator
@@ -206,6 +207,17 @@ def test_without_the_w_term_it_is_not(flat):
                for note in result["sara"]["notes"])
     assert abs(source(pixels(name + ".model"))[2] - 2) > 0.2
     assert max(block["noise_found"] for block in result["sara"]["blocks"]) > 3
+
+
+def test_series_and_w_gridder_lead_to_the_same_image(vis, tmp_path, monkeypatch):
+    made = []
+    for name, most in (("series", MOST_TERMS), ("gridder", 0)):
+        monkeypatch.setattr(widefield, "MOST_TERMS", most)
+        assert (WTerm.of(100.0, (FIELD, FIELD), (CELL_RAD, CELL_RAD), 1e-5).terms == 0) == (most == 0)
+        tsara(vis=vis, imagename=str(tmp_path / name), gridder="wproject", niter=10, **GRID)
+        made.append([pixels(str(tmp_path / f"{name}.{kind}")) for kind in ("model", "residual", "psf")])
+    for series, gridder in zip(*made):
+        assert 0 < np.abs(series - gridder).max() < 1e-3 * np.abs(series).max()
 
 
 def test_dirty_image_shows_it_where_tclean_does(vis, tmp_path):

@@ -119,7 +119,6 @@ def bessel_factors(argument, count, modified=False, dtype=np.float32):
         if small.any():
             few = np.array([np.ones(c.size), argument[start : start + CHUNK], argument[start : start + CHUNK] ** 2 / 4])
             rows = out[:, start : start + c.size]
-            rows[:, small] = 0
             rows[:3, small] = few[: min(count, 3), small]
     return out
 

@@ -229,8 +229,9 @@ class _tsara:
         'mfs'   one continuum image of all selected channels. The sky is assumed to be as bright at
                 all frequencies, unless spectralindex says how it changes: a source of another
                 spectrum is averaged over the band, and across a wide band leaves errors around it
-                that no model can fit (a spectral index of -0.8 from 1 to 2 GHz: 40 % between the
-                ends). Primary beams are not modelled, nor how they change with frequency.
+                that no model can fit (with a spectral index of -0.8 it loses 43 % of its
+                brightness from 1 to 2 GHz). How primary beams change with frequency is not
+                modelled.
         'cube'  an image of each channel, on the spectral axis that tclean makes of the same
                 parameters. The channels are solved one after the other, each from its own data,
                 with its own blocks, bounds and beam; niter and the blocks are those of a channel.
@@ -310,8 +311,8 @@ class _tsara:
                       transform, which is far below the noise, for any field up to a hemisphere: by a
                       short series of transforms where the phases are small, and by the w-gridder of the
                       package ducc0 where they are large. The log says how large they are and which of
-                      the two is taken. It takes 3 to 60 times as long as 'standard' in the Fourier part
-                      of an iteration.
+                      the two is taken. The Fourier part of an iteration takes 3 to 70 times as long as
+                      with 'standard', the more the larger the phases.
         'wproject' applies to everything: model, .psf, .residual and the model column.
 
     wprojplanes : int, default -1
