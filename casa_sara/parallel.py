@@ -21,6 +21,7 @@ LAUNCHED = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")  # set by mpirun an
 SPIN, NAP = 0.02, 2e-4  # s of waiting at full speed; s of each pause after that
 GRACE = 10.0  # s that the other ranks have to end by themselves after an error
 PIECE = 1 << 28  # bytes of one message
+FEW = 1 << 20  # values that every rank can be given
 SHARED_MEMORY = "/dev/shm"
 
 
@@ -78,6 +79,10 @@ class Serial:
     def broadcast(self, value):
         """Return rank 0's value."""
         return value
+
+    def lead(self, values):
+        """Return rank 0's values: a list of numbers, as many on every rank. It takes less time than :meth:`broadcast`."""
+        return values
 
     def gather(self, value):
         """Return the list of the ranks' values, on every rank."""
@@ -163,12 +168,20 @@ class MPI(Serial):
         return wait
 
     def total(self, number):
-        self._meet()
-        return self._comm.allreduce(number)
+        return self._reduced(number, self._mpi.SUM)
 
     def largest(self, number):
-        self._meet()
-        return self._comm.allreduce(number, self._mpi.MAX)
+        return self._reduced(number, self._mpi.MAX)
+
+    def _reduced(self, number, operation):
+        value = np.array([number], float if isinstance(number, (float, np.floating)) else np.int64)
+        self._wait(self._comm.Iallreduce(self._mpi.IN_PLACE, value, operation))
+        return value[0].item()
+
+    def lead(self, values):
+        values = np.array(values, float)
+        self._wait(self._comm.Ibcast(values))
+        return values.tolist()
 
     def mean(self, values, dtype=None):
         dtype = values.dtype if dtype is None else np.dtype(dtype)
@@ -176,6 +189,8 @@ class MPI(Serial):
         return dtype.type(total / count)
 
     def median(self, values):
+        if self.total(values.size) <= FEW:
+            return np.median(np.concatenate([part.ravel() for part in self.gather(values)]))
         values = np.sort(values, axis=None)
         bits = values.view({4: np.int32, 8: np.int64}[values.itemsize])  # of numbers ≥ 0: these are in the same order
         count = self.total(values.size)
