@@ -29,10 +29,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from casa_sara.balance import basis_costs, muster, operator_costs
 from casa_sara.casa.census import Census
+from casa_sara.mpi import world
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator, share_of
 from casa_sara.options import SARA_BASES, ImageGrid, SolverOptions
-from casa_sara.parallel import world
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from iteration import visibilities
 from machine import resident_mb

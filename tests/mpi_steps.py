@@ -2,7 +2,7 @@
 
     mpirun -n 3 python mpi_steps.py steps.json
 
-A step is [kind, task parameters]; its outcome is printed by every rank as one line of JSON.
+A step is [kind, task parameters]; every rank adds its outcome to a file of its own, steps.json.RANK, as one line of JSON.
 """
 
 import contextlib
@@ -77,4 +77,5 @@ if __name__ == "__main__":
         steps = json.load(file)
     for number, (kind, parameters) in enumerate(steps):
         found = KINDS[kind](**parameters)
-        print("\n" + json.dumps(dict(step=number, rank=RANK, **found)), flush=True)
+        with open(f"{sys.argv[1]}.{RANK}", "a") as file:
+            file.write(json.dumps(dict(step=number, **found)) + "\n")

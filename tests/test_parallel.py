@@ -19,8 +19,9 @@ from casa_sara import tsara
 from casa_sara.balance import muster
 from casa_sara.casa import ms as ms_module
 from casa_sara.casa.census import Census
+from casa_sara.mpi import LAUNCHED
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.parallel import LAUNCHED, Serial
+from casa_sara.parallel import Serial
 from casa_sara.solver.record import ITERATION_LIMIT, STOPPED_BY_USER
 
 ARCSEC = np.pi / 180 / 3600
@@ -87,10 +88,10 @@ def _mpirun(ranks, steps, folder):
     done = subprocess.run(["mpirun", *over, "-n", str(ranks), sys.executable, mpi_steps.__file__, str(path)], cwd=folder,
                           env=environment, capture_output=True, text=True, timeout=LIMIT)
     said = [{} for _ in steps]
-    for line in done.stdout.split("\n"):
-        if line.startswith('{"step"'):
+    for rank in range(ranks):
+        for line in Path(f"{path}.{rank}").read_text().splitlines() if os.path.exists(f"{path}.{rank}") else ():
             found = json.loads(line)
-            said[found.pop("step")][found.pop("rank")] = found
+            said[found.pop("step")][rank] = found
     return done, said
 
 
