@@ -19,6 +19,7 @@ __all__ = ["basis_costs", "muster", "operator_costs"]
 DIRAC, WAVELET, TAP = 2.3, 3.3, 0.17  # of a pixel: the pixel basis, a wavelet, and more for each tap
 PIXEL, CELL, SAMPLE = 5.0, 22.0, 150.0  # of the operator and its adjoint: a pixel, a cell of the uv grid, a visibility
 CELL_BYTES = 8
+ALIKE = 0.05  # times that differ by less are the same
 
 
 def basis_costs(wavelets, shape):
@@ -66,5 +67,6 @@ def muster(comm, census, grid, options, fits=lambda crew: True):
             owners[basis] = np.argmin(load)
             load[owners[basis]] += bases[basis]
         plans.append((load.max(), Crew(comm, readers, tuple(owners.tolist()))))
-    plans.sort(key=lambda plan: plan[0])
+    least = min(load for load, _ in plans)
+    plans.sort(key=lambda plan: int(plan[0] / least / ALIKE))  # of plans that are alike the one with fewest readers first
     return next((crew for _, crew in plans if fits(crew)), plans[0][1])

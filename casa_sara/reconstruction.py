@@ -124,7 +124,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
             checkpoint = None
 
     def keep(stage, now):
-        if checkpoint is not None and comm.broadcast(checkpoint.due(now)):
+        if checkpoint is not None and comm.lead([checkpoint.due(now)])[0]:
             state = solution.state(stage, layout, crew)
             comm.once(checkpoint.keep, lambda: state, solution.ppd.iteration, now=True)
 

@@ -89,7 +89,7 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
 
     with stop_on_interrupt() as pressed:
         reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
-                                     lambda: crew.comm.broadcast(pressed() or bool(watch and watch.deadline.near())),
+                                     lambda: bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0]),
                                      checkpoint, support, crew)
     progress.close()
     record = reconstruction.record

@@ -20,6 +20,7 @@ NOT_IMPORTED = {
     "six": "casatasks imports it and does not require it",
 }
 CASA = {"casaconfig", "casatools", "casatasks"}
+OF_USERS = {"casampi"}  # CASA's own, used where it is in charge
 
 # What each room may import beside itself and the standard library: other rooms and packages.
 ROOMS = {
@@ -27,31 +28,46 @@ ROOMS = {
     "tasks": {"casa_sara.private"},
     "gotasks": {"casa_sara.private", "casa_sara.tasks"},
     "private": {
-        "casa_sara", "casa_sara.cube", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal",
-        "casa_sara.resources", "casa_sara.solver",
-        "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile", "numpy", "casashell", *CASA,
+        "casa_sara", "casa_sara.cube", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal", "casa_sara.resources",
+        "casa_sara.solver",
+        "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile",
+        "casa_sara.mpi", "casa_sara.parallel", "numpy", "casashell", "mpi4py", *OF_USERS, *CASA,
     },
     "interrupt": set(),
     "deadline": set(),
-    "problem": {"casa_sara.operators", "casa_sara.outliers", "casa_sara.solver", "casa_sara.visibilities", "numpy"},
+    "parallel": {"numpy"},
+    "mpi": {"casa_sara.parallel", "numpy", "mpi4py"},
+    "sharing": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
+    "balance": {"casa_sara.operators", "casa_sara.sharing", "numpy"},
+    "problem": {
+        "casa_sara.operators", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing", "casa_sara.solver",
+        "casa_sara.visibilities", "numpy",
+    },
     "resources": set(),
     "options": set(),
-    "visibilities": {"numpy"},
-    "noise": {"casa_sara.visibilities", "numpy"},
-    "cautions": {"casa_sara.visibilities", "numpy", "scipy"},
-    "outliers": {"casa_sara.noise", "casa_sara.visibilities", "numpy"},
-    "casa": {"casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", *CASA},
-    "operators": {
-        "casa_sara.options", "casa_sara.visibilities", "numpy", "scipy", "finufft", "ducc0", "numba", "llvmlite", "pywt",
+    "visibilities": {"casa_sara.parallel", "numpy"},
+    "noise": {"casa_sara.parallel", "casa_sara.sharing", "numpy"},
+    "cautions": {"casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy"},
+    "outliers": {"casa_sara.noise", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
+    "casa": {
+        "casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.parallel", "casa_sara.sharing",
+        "casa_sara.visibilities", "numpy", "scipy", *CASA,
     },
-    "solver": {"casa_sara.options", "numpy", "scipy", "numba"},
+    "operators": {
+        "casa_sara.options", "casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy", "finufft", "ducc0", "numba",
+        "llvmlite", "pywt",
+    },
+    "solver": {"casa_sara.options", "casa_sara.parallel", "numpy", "scipy", "numba"},
     "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
     "jsonfile": set(),
 }
-LIBRARY = ("options", "visibilities", "noise", "cautions", "outliers", "problem", "operators", "solver", "analysis")
+LIBRARY = (
+    "options", "parallel", "visibilities", "sharing", "balance", "noise", "cautions", "outliers", "problem", "operators", "solver",
+    "analysis",
+)
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["forecast"] = {"casa_sara.operators"}
+ROOMS["forecast"] = {"casa_sara.operators", "casa_sara.sharing"}
 ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
 ROOMS["rehearsal"] = {
     "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", "numpy", *NUMERICS,
@@ -108,7 +124,9 @@ def test_dependency_table_is_what_is_imported():
     imported = {DISTRIBUTIONS.get(name, name) for module in MODULES for name in imports(module)}
     imported = {name for name in imported if not name.startswith("casa_sara")}
     table = required("options", "install_requires")
-    missing = imported - table - required("options.extras_require", "shell")
+    missing = imported - table - OF_USERS
+    for extra in ("shell", "mpi"):
+        missing -= required("options.extras_require", extra)
     idle = table - imported - NOT_IMPORTED.keys()
     assert not missing and not idle, f"not in setup.cfg: {missing}; in setup.cfg and not imported: {idle}"
 

@@ -286,7 +286,7 @@ def test_corrected_column_absent_is_said_loudly(vis, tmp_path):
     (dict(databound="fixed", l2bound=[-1.0]), "l2bound"),
     (dict(databound="fixed", l2bound=[1.0, 2.0, 3.0]), "l2bound"),
     (dict(startmodel="absent.model"), "startmodel"),
-    (dict(parallel=True), "parallel"),
+    (dict(parallel=True), "parallel.*mpirun"),
     (dict(blocks=-1), "blocks"),
     (dict(blocks=10**8), "blocks"),
     (dict(wavelets=["db9"]), "wavelets"),

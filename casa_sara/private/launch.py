@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from casa_sara.casa import log
-from casa_sara.parallel import MPI, world
+from casa_sara.mpi import MPI, world
 
 __all__ = ["in_parallel", "serve"]
 

@@ -158,7 +158,7 @@ class AdaptivePPD:
         self.comm.settle()
         np.sqrt(norms_sq(), out=self.residual_norms)
         sums = [*self._sums[:, :3].sum(axis=0).tolist(), float(self._sums[:, 3].max())]
-        change, norm, self.model_flux, self.model_max = self.comm.broadcast(sums)
+        change, norm, self.model_flux, self.model_max = self.comm.lead(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
         self.iteration += 1
 

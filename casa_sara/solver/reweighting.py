@@ -199,7 +199,7 @@ def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
 
 def _renew_weights(ppd, bounds, schedule, stage):
     """Re-weight by the present solution; return False, with nothing done, when one more would change nothing."""
-    change = ppd.comm.broadcast(_relative(ppd.model, stage.previous))
+    change = ppd.comm.lead([_relative(ppd.model, stage.previous)])[0]
     scale = FIRST_SCALE * schedule.reweight_decay**stage.k
     released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
     if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:

@@ -1,0 +1,218 @@
+"""The task on several ranks of an MPI job: the same image, the same bounds, and an end whatever happens."""
+
+import importlib.util
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated_ms import edit, simulate
+
+casatools = pytest.importorskip("casatools")
+
+import mpi_steps
+from casa_sara import tsara
+from casa_sara.balance import muster
+from casa_sara.casa import ms as ms_module
+from casa_sara.casa.census import Census
+from casa_sara.mpi import LAUNCHED
+from casa_sara.options import ImageGrid, SolverOptions
+from casa_sara.parallel import Serial
+from casa_sara.solver.record import ITERATION_LIMIT, STOPPED_BY_USER
+
+ARCSEC = np.pi / 180 / 3600
+SKY = [(1.0, -12 * ARCSEC, 7 * ARCSEC), (0.4, 9 * ARCSEC, -10 * ARCSEC), (0.5, 0, 0), (0.2, 2 * ARCSEC, 1 * ARCSEC)]
+GRID = dict(imsize=72, cell="0.9arcsec", datacolumn="data", nthreads=1)
+LIMIT = 300  # s; a quiet machine needs a tenth
+AGREE = 1e-5
+WILD = 1e4
+
+mpi = pytest.mark.skipif(shutil.which("mpirun") is None or importlib.util.find_spec("mpi4py") is None
+                         or importlib.util.find_spec("casampi") is not None,
+                         reason="needs mpirun and mpi4py, and no casampi, which makes servers of the ranks")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("parallel")
+
+
+@pytest.fixture(scope="module")
+def vis(folder):
+    """Four scans; one sample is wild, one row is flagged."""
+    name = simulate(folder / "c.ms", configuration="c", antennas=14, sky=SKY, noise=0.05, scans=4, integration=20.0,
+                    spacing_seconds=5400.0, hour_angle=-2.5, seed=4)
+    edit(name, "DATA", _spoil)
+    edit(name, "FLAG_ROW", lambda flag: np.arange(flag.size) == 17)
+    return str(name)
+
+
+def _spoil(data):
+    data[:, 1, 700] = WILD
+    return data
+
+
+@pytest.fixture(scope="module")
+def alone(vis, folder):
+    """What one process finds, by the name of the run."""
+    found = {}
+    chunk, ms_module._CHUNK = ms_module._CHUNK, mpi_steps.ms._CHUNK
+    for name, parameters in _runs(vis, folder / "alone").items():
+        found[name] = mpi_steps.run(**parameters)
+    ms_module._CHUNK = chunk
+    return found
+
+
+def _runs(vis, folder, **more):
+    """The runs that all numbers of ranks do: re-weighted, with hard bounds, and with equal blocks and uniform weights."""
+    folder.mkdir(exist_ok=True)
+    common = dict(vis=vis, **GRID, **more)
+    return {
+        "whole": dict(common, imagename=str(folder / "whole"), niter=125),
+        "hard": dict(common, imagename=str(folder / "hard"), niter=12, nreweights=0, databound="weights", blocks=3,
+                     weighting="uniform"),
+    }
+
+
+def _mpirun(ranks, steps, folder):
+    """Run the steps; return the exit status and what each rank said of each step."""
+    path = folder / f"steps{ranks}.json"
+    path.write_text(json.dumps(steps))
+    environment = dict(os.environ, OMPI_ALLOW_RUN_AS_ROOT="1", OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1", OMP_NUM_THREADS="1",
+                       PYTHONPATH=os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
+    over = ["--oversubscribe"] if "Open MPI" in subprocess.run(["mpirun", "--version"], capture_output=True, text=True).stdout else []
+    done = subprocess.run(["mpirun", *over, "-n", str(ranks), sys.executable, mpi_steps.__file__, str(path)], cwd=folder,
+                          env=environment, capture_output=True, text=True, timeout=LIMIT)
+    said = [{} for _ in steps]
+    for rank in range(ranks):
+        for line in Path(f"{path}.{rank}").read_text().splitlines() if os.path.exists(f"{path}.{rank}") else ():
+            found = json.loads(line)
+            said[found.pop("step")][rank] = found
+    return done, said
+
+
+def _pixels(name, product):
+    ia = casatools.image()
+    ia.open(f"{name}.{product}")
+    try:
+        return ia.getchunk()[:, :, 0, 0]
+    finally:
+        ia.close()
+
+
+def _same_images(one, other, products=("model", "psf")):
+    for product in products:
+        a, b = _pixels(one, product), _pixels(other, product)
+        assert np.abs(a - b).max() <= AGREE * np.abs(b).max(), product
+    residuals = [_pixels(name, "residual") for name in (one, other)]
+    assert np.abs(residuals[0] - residuals[1]).max() <= AGREE * _pixels(other, "image").max()
+
+
+def _same_findings(found, expected, ranks):
+    assert sorted(found) == list(range(ranks))
+    assert all(found[rank] == found[0] for rank in found)  # the same dictionary on every rank
+    exact = ("iterdone", "stopcode", "visibilities", "wild", "labels", "dropped")
+    assert {name: found[0][name] for name in exact} == {name: expected[name] for name in exact}
+    np.testing.assert_allclose(found[0]["noise"], expected["noise"], rtol=1e-12)
+    for name in ("bounds", "residual_norm"):
+        np.testing.assert_allclose(found[0][name], expected[name], rtol=AGREE)
+
+
+@pytest.fixture(scope="module")
+def two(vis, folder, alone):
+    """Two ranks: the runs, a refusal that the job survives, and a run that is asked to stop."""
+    runs = _runs(vis, folder / "two", parallel=True)
+    stopped = dict(runs["whole"], imagename=str(folder / "two" / "stopped"))
+    steps = [["run", runs["whole"]], ["refused", runs["whole"]], ["run", runs["hard"]], ["stopped", stopped]]
+    return _mpirun(2, steps, folder)
+
+
+@pytest.fixture(scope="module")
+def three(folder, two, vis, alone):
+    """Three ranks: go on with what two have left, and a rank that is killed."""
+    runs = _runs(vis, folder / "three", parallel=True)
+    resume = dict(runs["whole"], imagename=str(folder / "two" / "stopped"), restart=True)
+    return _mpirun(3, [["run", resume], ["killed", runs["whole"]], ["run", runs["whole"]]], folder)
+
+
+@mpi
+def test_two_ranks_find_what_one_process_finds(two, alone, folder):
+    done, said = two
+    assert done.returncode == 0, done.stderr
+    for step, name in ((0, "whole"), (2, "hard")):
+        _same_findings(said[step], alone[name], 2)
+        _same_images(folder / "two" / name, folder / "alone" / name)
+    assert alone["whole"]["wild"] == [700] and len(alone["hard"]["bounds"]) == 3
+    assert alone["whole"]["stopcode"] == ITERATION_LIMIT
+
+
+@mpi
+def test_an_error_of_all_is_raised_by_all_and_the_job_goes_on(two):
+    said = two[1][1]
+    assert sorted(said) == [0, 1]
+    assert all(found["error"].startswith("FileExistsError: imagename") for found in said.values())
+
+
+@mpi
+def test_a_run_stopped_on_two_ranks_goes_on_on_three_to_the_same_image(two, three, alone, folder):
+    stopped, resumed = two[1][3], three[1][0]
+    assert [stopped[rank]["stopcode"] for rank in range(2)] == [STOPPED_BY_USER] * 2
+    assert resumed[0]["resumed"] == [stopped[0]["iterdone"]] and stopped[0]["iterdone"] < 30
+    _same_findings(resumed, alone["whole"], 3)
+    _same_images(folder / "two" / "stopped", folder / "alone" / "whole")
+
+
+@mpi
+def test_a_rank_that_is_killed_ends_the_job(three):
+    done, said = three
+    assert done.returncode != 0
+    assert not said[2]  # nothing came after
+
+
+@mpi
+def test_four_ranks_and_the_error_of_one(vis, folder, alone):
+    """The error of one rank is raised by all, each of which could still write, and the job ends."""
+    runs = _runs(vis, folder / "four", parallel=True)
+    failing = dict(runs["whole"], imagename=str(folder / "four" / "failing"))
+    done, said = _mpirun(4, [["run", runs["whole"]], ["failing", failing]], folder)
+    _same_findings(said[0], alone["whole"], 4)
+    _same_images(folder / "four" / "whole", folder / "alone" / "whole")
+    assert sorted(said[1]) == [0, 1, 2, 3]
+    assert all(found["error"] == "ArithmeticError: rank 1 has had enough" for found in said[1].values())
+    assert done.returncode != 0
+    assert not [path for path in (folder / "four").iterdir() if path.name.startswith(("failing", ".failing"))]
+
+
+def test_without_mpi_the_error_says_what_to_install_and_how_to_start(vis, monkeypatch):
+    for name in LAUNCHED:
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ValueError, match=r"parallel = True.*mpirun -n 4 .*pip install 'casa_sara\[mpi\]'"):
+        tsara(vis=vis, imagename="x", parallel=True, **GRID)
+
+
+class _Ranks(Serial):
+    """A communicator by its size alone."""
+
+    def __init__(self, size, rank=0):
+        self.size, self.rank = size, rank
+
+
+@pytest.mark.parametrize("size", [2, 3, 5, 16])
+@pytest.mark.parametrize("samples", [100, 10_000_000])
+def test_work_is_shared_whole_and_evenly(size, samples):
+    options, grid = SolverOptions(), ImageGrid((2048, 2048), (1e-6, 1e-6))
+    crew = muster(_Ranks(size), Census(samples, (1e5, 1e5)), grid, options)
+    readers = [crew.reader(rank) for rank in range(size)]
+    assert [number for number in readers if number is not None] == list(range(crew.readers)) and readers[0] == 0
+    assert len(crew.owners) == len(options.wavelets) and set(crew.owners) <= set(range(size))
+    # many visibilities spread over many ranks; few are not worth a second Fourier transform
+    assert crew.readers == 1 if samples == 100 else crew.readers > size // 2
+
+
+def test_what_does_not_fit_is_spread_further():
+    options, grid, census = SolverOptions(), ImageGrid((2048, 2048), (1e-6, 1e-6)), Census(100, (1e5, 1e5))
+    assert muster(_Ranks(4), census, grid, options, lambda crew: crew.readers >= 3).readers == 3
