@@ -241,7 +241,7 @@ def test_residual_is_left_as_it_is_by_a_smaller_beam(runs, tmp_path):
 
 @pytest.mark.parametrize("words", ["", [], [""], "common", ["common"]], ids=str)
 def test_restoring_beam_words_for_the_fitted_beam(words):
-    assert restoring_beam_words(words) == []
+    assert restoring_beam_words(words) == (["common"] if "common" in words else [])  # which differs for cubes
 
 
 @pytest.mark.parametrize(
