@@ -35,6 +35,7 @@ from casa_sara.solver.record import UNFINISHED
 from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import BlockInfo, Visibilities, sort_into_blocks
+from casa_sara.warmup import kernels_loading
 
 __all__ = [
     "PlaneImages", "Result", "Split", "describe", "image_limits", "make_image", "plane_images", "split", "write_column",
@@ -130,51 +131,39 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     checkpoint = checkpoint_of(selection, grid, options, output)
     if output.resume:
         comm.once(checkpoint.open)
-    # read
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), crew)
-    data.notes.extend(image_limits(data, grid, comm))
-    plane = comm.once(define_image_plane, data, selection, grid, output.pblimit)
-    grid = comm.once(with_spectrum, grid, plane)
-    if not plane.mask.any():
-        data.notes.append(nowhere_visible(grid, output))
-    _caution(data)
-    start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
-    if output.images_stand:
-        comm.once(_save_model, selection, data, grid, options, start)
-        return Result(data, comm.total(data.size), [], np.zeros(0), None, comm.once(_peak, output.imagename + ".residual"),
-                      float(start.sum(dtype=float)), forecast.summary())
-    support = comm.once(read_support, grid, plane)
-    if support is not None and start is not None:
-        start *= support
-    # split and weigh
-    part = split(data, output.blocks, comm)
-    data, blocks, offsets, noise = part.data, part.blocks, part.offsets, part.noise
-    describe(data, blocks, noise, grid.stokes, comm)
-    if grid.gridder == "wproject":
-        accuracy = operator_accuracy(data, offsets, noise, comm)
-        log.info(WTerm.of(comm.largest(data.max_w), grid.shape, grid.cell_rad, accuracy).words)
-    _point_spread(data, grid, weighting, options, plane, comm)  # what cannot be weighed or restored is refused before the hours
-    # solve
-    reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
-    if options.niter > 0:
-        deadline.reserve = _after_iterations(comm.total(data.size), grid, output, limits, deadline.elapsed())
-        watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
-        reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch, support, crew)
-        forecast = replace(forecast, iteration_s=watch.pace.seconds)
-        model = reconstruction.model
-        data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
-        offsets = np.searchsorted(reconstruction.kept, offsets)
-    doubtful = suspects(blocks, noise, reconstruction.l2_bounds) if reconstruction else []
-    for line in named_suspects(blocks, doubtful):
-        log.warn(line)
-    # write
-    with waiting_child() if comm.rank == 0 else nullcontext() as child:  # which starts meanwhile
+    with waiting_child() if comm.rank == 0 else nullcontext() as child, kernels_loading():  # both while CASA reads
+        # read
+        data, plane, grid = _read(selection, grid, output, crew)
+        start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
+        if output.images_stand:
+            comm.once(_save_model, selection, data, grid, options, start)
+            return Result(data, comm.total(data.size), [], np.zeros(0), None, comm.once(_peak, output.imagename + ".residual"),
+                          float(start.sum(dtype=float)), forecast.summary())
+        support = comm.once(read_support, grid, plane)
+        if support is not None and start is not None:
+            start *= support
+        # split and weigh
+        part = split(data, output.blocks, comm)
+        data, blocks, offsets, noise = part.data, part.blocks, part.offsets, part.noise
+        describe(data, blocks, noise, grid.stokes, comm)
+        if grid.gridder == "wproject":
+            accuracy = operator_accuracy(data, offsets, noise, comm)
+            log.info(WTerm.of(comm.largest(data.max_w), grid.shape, grid.cell_rad, accuracy).words)
+        _point_spread(data, grid, weighting, options, plane, comm)  # what cannot be weighed or restored is refused now
+        # solve
+        reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
+        if options.niter > 0:
+            deadline.reserve = _after_iterations(comm.total(data.size), grid, output, limits, deadline.elapsed())
+            watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
+            reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch, support,
+                                         crew)
+            forecast = replace(forecast, iteration_s=watch.pace.seconds)
+            model = reconstruction.model
+            data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
+            offsets = np.searchsorted(reconstruction.kept, offsets)
+        # write
         images = plane_images(data, model, selection, grid, weighting, options, plane, comm)
-        _caution(data, beyond_baselines(model, grid.cell_rad, -comm.largest(-data.min_uv)))
-        if support is not None:
-            images.pixels["mask"] = check_confined(model, support)
-            sigma = thermal_noise(data, images.weights, noise, offsets, comm)
-            _caution(data, left_outside(images.pixels["residual"], support, sigma))
+        doubtful = _look_back(images, support, reconstruction, Split(data, blocks, offsets, noise), grid, comm)
         result = Result(data, comm.total(data.size), blocks, noise, reconstruction, images.residual_peak, images.model_flux,
                         forecast.summary(), doubtful)
         comm.once(write_products, output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
@@ -183,6 +172,32 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if output.savemodel == "modelcolumn":
         comm.once(_save_model, selection, data, grid, options, model)
     return result
+
+
+def _read(selection, grid, output, crew):
+    """Return this rank's visibilities, the image plane, and the grid with the spectrum that it asks for."""
+    comm = crew.comm
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), crew)
+    data.notes.extend(image_limits(data, grid, comm))
+    plane = comm.once(define_image_plane, data, selection, grid, output.pblimit)
+    if not plane.mask.any():
+        data.notes.append(nowhere_visible(grid, output))
+    _caution(data)
+    return data, plane, comm.once(with_spectrum, grid, plane)
+
+
+def _look_back(images, support, reconstruction, part, grid, comm):
+    """Point out what is doubtful about data and images; return the suspect blocks, and add the mask to the images."""
+    data, pixels = part.data, images.pixels
+    doubtful = suspects(part.blocks, part.noise, reconstruction.l2_bounds) if reconstruction else []
+    for line in named_suspects(part.blocks, doubtful):
+        log.warn(line)
+    _caution(data, beyond_baselines(pixels["model"], grid.cell_rad, -comm.largest(-data.min_uv)))
+    if support is not None:
+        pixels["mask"] = check_confined(pixels["model"], support)
+        sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
+        _caution(data, left_outside(pixels["residual"], support, sigma))
+    return doubtful
 
 
 def split(data, blocks, comm=SERIAL):

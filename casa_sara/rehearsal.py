@@ -26,6 +26,8 @@ from casa_sara.visibilities import sort_into_blocks
 
 __all__ = ["foresee", "rehearse"]
 
+WRITER = 130_000_000  # bytes of the process that writes the images, while it waits
+
 
 def foresee(selection, grid, options, limits, comm=SERIAL):
     """Share the work of a run among the ranks, and forecast the memory of this one, from the numbers of rows, channels and pixels.
@@ -37,7 +39,7 @@ def foresee(selection, grid, options, limits, comm=SERIAL):
     casa_sara.forecast.Forecast
     casa_sara.sharing.Crew
     """
-    resident, available = resident_memory(), available_memory() // comm.node_size
+    resident, available = resident_memory(), (available_memory() - WRITER) // comm.node_size
     channels, share = _channels(selection, grid)
     for flags in (False, True):
         census = comm.once(take_census, selection, flags, grid.stokes)

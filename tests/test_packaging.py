@@ -67,6 +67,7 @@ LIBRARY = (
 )
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
+ROOMS["warmup"] = {"casa_sara.operators", "casa_sara.solver", "numpy"}
 ROOMS["forecast"] = {"casa_sara.operators", "casa_sara.sharing"}
 ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
 ROOMS["rehearsal"] = {
@@ -82,7 +83,7 @@ ROOMS["cube"] = {
 }
 ROOMS["imaging"] = {
     "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.rehearsal", "casa_sara.solving",
-    "casa_sara.timing", "numpy", *NUMERICS,
+    "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
 }
 ROOMS["injection"] = {"casa_sara.casa", "casa_sara.solving", "numpy", *NUMERICS}
 ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "numpy", *NUMERICS}
