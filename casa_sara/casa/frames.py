@@ -193,7 +193,7 @@ class Geometry:
 
     def frequencies(self, group, field, time):
         """Return the LSRK frequencies, float64 (R, C) in Hz, of rows as :meth:`wavelengths` takes them."""
-        return group.freqs_hz * self._lsrk_factors(group.frame, field, time)[:, None]
+        return group.freqs_hz * self.lsrk_factors(group.frame, field, time)[:, None]
 
     def _note_range(self, group, factors):
         """Widen `freq_range_hz` to the channels of these rows."""
