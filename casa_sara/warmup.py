@@ -32,11 +32,13 @@ def kernels_loading() -> Iterator[None]:
 
 def use_every_kernel() -> None:
     """Call every kernel of a solution once, on an image of 32×32 pixels and three visibilities."""
-    uv = np.array([[0.0, 1e3, 2e3], [0.0, 5e2, 1e3]])
-    measurement = MeasurementOperator(uv, 1e-5, (32, 32), eps=1e-5)
+    uv, image = np.array([[0.0, 1e3, 2e3], [0.0, 5e2, 1e3]]), np.ones((32, 32), np.float32)
+    for eps in (2e-5, 1e-6):  # of most solutions, and of the images: the gridding kernels are compiled for their width
+        measurement = MeasurementOperator(uv, 1e-5, image.shape, eps=eps)
+        vis = measurement.forward(image)
+        measurement.adjoint(vis)
     dictionary = SaraDictionary(measurement.shape)
-    vis, precond = measurement.forward(np.ones(measurement.shape, np.float32)), np.ones(3, np.float32)
-    norm_sq = 3.0 * 32**2
+    precond, norm_sq = np.ones(3, np.float32), 3.0 * image.size
     model, _ = nnls(measurement, vis, precond, norm_sq, max_iter=1)
     ppd = AdaptivePPD(measurement, dictionary, vis, [0, 3], precond, norm_sq)
     ppd.start_from(model)

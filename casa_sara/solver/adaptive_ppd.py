@@ -90,6 +90,8 @@ class AdaptivePPD:
         Σx and max x after the last step.
     unit_jy : float
         Jy/pixel in the unit of the model, for the record.
+    scratch_vis, scratch_image : complex (M,), real (nx, ny)
+        Work space between the steps, each of which overwrites it.
     """
 
     def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True,
@@ -116,6 +118,16 @@ class AdaptivePPD:
         self._sums, = comm.images(1, (measurement.shape[0], 4), float)
         self.iteration = 0
         self.unit_jy = 1.0
+
+    @property
+    def scratch_vis(self):
+        """Work space, complex (M,)."""
+        return self._phi_bar
+
+    @property
+    def scratch_image(self):
+        """Work space, real (nx, ny)."""
+        return self._data_gradient
 
     @property
     def n_blocks(self):

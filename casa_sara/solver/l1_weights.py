@@ -16,7 +16,7 @@ def band_noise(ppd, bounds, seed=20180404):
 
     One realisation of the noise, weighted by 1/s_m² as the data are, is carried to the image and normalised by
     the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
-    scratch space.
+    scratch space, and so do those of `ppd`.
 
     Parameters
     ----------
@@ -31,12 +31,12 @@ def band_noise(ppd, bounds, seed=20180404):
         Of a Dirac coefficient, which is a pixel divided by √(number of bases).
     """
     rng = np.random.default_rng(seed)
-    noise = np.empty_like(ppd.vis)
+    noise = ppd.scratch_vis
     for j, (a, b) in enumerate(ppd.blocks() if ppd.vis.size else ()):
         here = ppd.begins[j], b - a, ppd.block_sizes[j]
         noise[a:b] = _normal(rng, *here) + 1j * _normal(rng, *here)
         noise[a:b] *= np.sqrt(bounds.noise_weights[j] * ppd.spread[a:b])
-    image = ppd.adjoint(noise)
+    image = ppd.adjoint(noise, ppd.scratch_image)
     image /= image.dtype.type(bounds.total_weight)
     coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
     bands = [_rms(coefs[band.slice]) for band in ppd.dictionary.bands()]

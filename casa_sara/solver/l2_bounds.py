@@ -174,7 +174,7 @@ class AdaptiveBounds(_NoiseLevels):
         """
         if self.sample_weights is None:
             return
-        model_vis = ppd.measurement.forward(ppd.model)
+        model_vis = ppd.measurement.forward(ppd.model, ppd.scratch_vis)
         shares = np.zeros(ppd.n_blocks)
         for j, (start, stop) in enumerate(ppd.blocks()):
             power = np.abs(model_vis[start:stop]) ** 2

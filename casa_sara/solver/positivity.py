@@ -73,8 +73,14 @@ def _wanted(ppd, bounds):
     """Which pixels ask to be released; bool (nx, ny)."""
     weights = ppd.precond * ppd.spread
     weights *= np.repeat(bounds.noise_weights.astype(weights.dtype), np.diff(ppd.offsets))
-    image = np.zeros_like(ppd.model)
+    image, vis = ppd.scratch_image, ppd.scratch_vis
+    image.fill(0)
     image[0, 0] = 1
-    noise_sq = float(ppd.adjoint(ppd.precond * weights * ppd.measurement.forward(image), image)[0, 0])
-    gradient = ppd.adjoint(weights * (ppd.vis - ppd.measurement.forward(ppd.model)), image)
+    ppd.measurement.forward(image, vis)
+    vis *= ppd.precond * weights
+    noise_sq = float(ppd.adjoint(vis, image)[0, 0])
+    ppd.measurement.forward(ppd.model, vis)
+    np.subtract(ppd.vis, vis, out=vis)
+    vis *= weights
+    gradient = ppd.adjoint(vis, image)
     return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest) & (ppd.lowest < np.inf)
