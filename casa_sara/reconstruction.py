@@ -124,7 +124,11 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
             checkpoint = None
 
     def keep(stage, now):
-        if checkpoint is not None and comm.lead([checkpoint.due(now)])[0]:
+        if checkpoint is None:
+            return
+        if comm.size == 1:
+            checkpoint.keep(lambda: solution.state(stage, layout, crew), solution.ppd.iteration, now)
+        elif comm.lead([checkpoint.due(now)])[0]:  # then all ranks take part in gathering the state
             state = solution.state(stage, layout, crew)
             comm.once(checkpoint.keep, lambda: state, solution.ppd.iteration, now=True)
 

@@ -33,13 +33,17 @@ def run(**parameters):
 
 def stopped(**parameters):
     """A run that rank 0, and no other, is asked to end after some iterations."""
-    asked = []
+    step, done = AdaptivePPD.step, []
+
+    def counted(ppd):
+        step(ppd)
+        done.append(ppd.iteration)
 
     @contextlib.contextmanager
     def stop_soon():
-        yield lambda: RANK == 0 and (asked.append(1) or len(asked) > 75 + WHEN)
+        yield lambda: RANK == 0 and len(done) >= WHEN
 
-    with mock.patch.object(solving, "stop_on_interrupt", stop_soon):
+    with mock.patch.object(solving, "stop_on_interrupt", stop_soon), mock.patch.object(AdaptivePPD, "step", counted):
         return run(**parameters)
 
 

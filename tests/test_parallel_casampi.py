@@ -20,7 +20,7 @@ SCRIPT = """
 import json
 import casatasks  # from here on all processes but the first are servers
 from casa_sara import tsara
-parameters = dict(vis="d.ms", imagename="image", imsize=64, cell="10arcsec", datacolumn="data", niter=3, nthreads=1)
+parameters = dict(vis="d.ms", imagename="image", imsize=64, cell="3arcsec", datacolumn="data", niter=3, nthreads=1)
 result = tsara(parallel=True, **parameters)
 try:
     tsara(parallel=True, **parameters)
