@@ -83,8 +83,8 @@ class _OfChannel:
         """Nothing to do: the data of all channels are known by their contents."""
 
     @contextmanager
-    def applied(self):
-        """Yield `state`, to be put to use."""
+    def applied(self, read=True):
+        """Yield `state`, to be put to use; `read` as of Checkpoint."""
         try:
             yield self.state
         except (LookupError, TypeError, ValueError, AttributeError) as error:

@@ -19,13 +19,13 @@ READING = 62  # chunks, and one column joined
 POINT = 28  # of the operator: NonUniformFFT's Points
 PLANNING = 64  # frequencies and factors, while the operator is built
 SOLVER = 52  # whitened data, density, preconditioner, dual, Φx̄, Φz, spread, weights
-PASSING = 28  # noise, predicted visibilities and weights of a re-weighting
+PASSING = 12  # weights of a pass between the iterations
 WEIGHING = 30  # uv cells and densities
 SORTING = 12  # of a cube: channels of the samples, and their order
 CHECKPOINT = 20  # the dual, Φz and the spread
 # image planes, each 4 bytes a pixel
 PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
-NORM, NNLS, SOLVING, WRITING = 8, 4, 10, 10
+NORM, NNLS, SOLVING, WRITING = 8, 4, 9, 10
 CUBES = 3  # psf, residual and model of each channel
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run

@@ -24,6 +24,7 @@ CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "os.e
 IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve", "joblib", "cloudpickle", "subprocess", "pty", "ctypes.util",
            "runpy", "code", "xmlrpc", "telnetlib"}
 EXCEPTIONS = {
+    ("mpi.py", "pickle"): "an error of its own is packed and unpacked, to see whether mpi4py can send it",
     ("casa/child.py", "subprocess"): "this Python, told its job by JSON and names out of a list of its own",
     ("private/shelltask.py", "runpy"): "tget runs what tput saved, as CASA's own tasks do",
     ("private/shelltask.py", "runpy.run_path"): "tget runs what tput saved, as CASA's own tasks do",
