@@ -41,7 +41,7 @@ def stopped(**parameters):
 
     @contextlib.contextmanager
     def stop_soon():
-        yield lambda: RANK == 0 and len(done) >= WHEN
+        yield lambda: RANK == 0 and max(done, default=0) >= WHEN
 
     with mock.patch.object(solving, "stop_on_interrupt", stop_soon), mock.patch.object(AdaptivePPD, "step", counted):
         return run(**parameters)

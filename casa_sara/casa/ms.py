@@ -30,7 +30,7 @@ _ROW_COLUMNS = {
     "antenna2": "ANTENNA2",
 }
 _SAMPLE_DTYPES = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64, "row": np.int32,
-                  "chan": np.int16}
+                  "chan": np.int16, "freq_hz": np.float32}
 _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64}
 
 
