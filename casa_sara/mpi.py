@@ -16,7 +16,7 @@ from casa_sara.parallel import Serial
 __all__ = ["LAUNCHED", "MPI", "world"]
 
 LAUNCHED = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")  # set by mpirun and srun, one of them at least
-SPIN, NAP = 0.02, 2e-4  # s of waiting at full speed; s of each pause after that
+SPIN, NAP = 0.001, 1e-4  # s of waiting at full speed; s of each pause after that
 GRACE = 10.0  # s that the other ranks have to end by themselves after an error
 PIECE = 1 << 28  # bytes of one message
 FEW = 1 << 20  # values that every rank can be given
@@ -174,9 +174,16 @@ class MPI(Serial):
         return self._node.allgather(value).count(value)
 
     def images(self, count, shape, dtype):
+        return self._shared(count, shape, dtype) or super().images(count, shape, dtype)
+
+    def slots(self, shape, dtype):
+        return self._shared(self.size, shape, dtype) if self.node_size == self.size else None
+
+    def _shared(self, count, shape, dtype):
+        """Return zeroed images in memory that the ranks of this machine share; None where it has no room for them."""
         size = count * int(np.prod(shape)) * np.dtype(dtype).itemsize
         if not self._node_has_room(size):
-            return super().images(count, shape, dtype)
+            return None
         self.part = self._node.Get_rank(), self.node_size
         window = self._mpi.Win.Allocate_shared(size if self._node.Get_rank() == 0 else 0, comm=self._node)
         self._windows.append(window)

@@ -104,6 +104,9 @@ class Serial:
         """Return zeroed images, which the ranks of one machine share: each writes its `part`, then all `settle`."""
         return [np.zeros(shape, dtype) for _ in range(count)]
 
+    def slots(self, shape, dtype):
+        """Return an image for each rank, in memory that all ranks share; None where they do not."""
+
     def own(self, image):
         """Return an image of `images` as an array that only this rank writes to."""
         return image

@@ -103,7 +103,8 @@ class AdaptivePPD:
         dtype = vis.real.dtype
         self.model, self.anchor, self.model_bar, self.lowest = comm.images(4, measurement.shape, dtype)
         self.lowest[...] = 0 if positivity else -np.inf
-        self._data_gradient, self._prior_gradient = (np.zeros(measurement.shape, dtype) for _ in range(2))
+        self._data_gradient, self._slots = np.zeros(measurement.shape, dtype), comm.slots(measurement.shape, dtype)
+        self._prior_gradient = self._slots[comm.rank] if self._slots else np.zeros(measurement.shape, dtype)
         self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
         self.spread = np.ones_like(precond)
         self.l1_dual, self.l1_weights = dictionary.allocate(), None
@@ -185,13 +186,24 @@ class AdaptivePPD:
             kernels.update_dual(*args, self.spread, real(self.multipliers[j]), relaxation, start, stop)
 
     def _summed_gradients(self, steps):
-        """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both."""
+        """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.
+
+        Ranks that share their memory need no messages: each adds what it needs, the rows of its part of the image.
+        """
         gradients = self._data_gradient, self._prior_gradient
         if self.comm.size == 1:
             return gradients, steps
-        self.measurement.workers.run(kernels.add_scaled, *gradients, steps[1])
-        gradient = self.comm.sum(self._prior_gradient)
-        return (gradient, gradient), (steps[0], type(steps[1])(0), steps[2])
+        run, real = self.measurement.workers.run, type(steps[1])
+        if self.vis.size:
+            run(kernels.add_scaled, *gradients, steps[1])
+        if not self._slots:
+            gradient = self.comm.sum(self._prior_gradient)
+            return (gradient, gradient), (steps[0], real(0), steps[2])
+        self.comm.settle()
+        first, *between, last = self._slots
+        for other in between:
+            run(kernels.add_scaled, other, first, real(1), part=self.comm.part)
+        return (first, last), (steps[0], real(1), steps[2])
 
     def adjoint(self, vis, out=None):
         """Return Φ†·vis of the samples of all ranks."""
