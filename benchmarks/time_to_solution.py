@@ -1,10 +1,10 @@
 """Wall time from MeasurementSets to images, and what it buys: tsara with defaults beside tclean and wsclean multiscale.
 
-    python benchmarks/time_to_solution.py FOLDER [--scenes cyga M31 W28] [--repeat 3]
+    python benchmarks/time_to_solution.py FOLDER [--scenes cyga M31 W28] [--repeat 3] [--known briggs short]
 
 Scenes and settings are those of quality.py. The best tclean multiscale run of a scene is that of its five settings and two
 weightings whose model has the highest SNR to the truth; all ten are tried first, and their own spread is not counted against
-anybody. wsclean (where it is installed) runs multiscale with Briggs −1 and natural weights, each with its automatic threshold at one
+anybody; --known leaves the search out. wsclean (where it is installed) runs multiscale with Briggs −1 and natural weights, each with its automatic threshold at one
 and two times the noise and an automatic mask; its best is taken in the same way. Then the best runs and tsara take turns, every run
 in a new process: time is that of the call, reading and writing included, importing not. tclean runs with one and with two OpenMP
 threads, and the faster counts. SNR = 20 log10(‖truth‖/‖truth − model‖), of the models as they are and smoothed to half the
@@ -61,9 +61,10 @@ def time_task(folder, task, parameters, threads):
     return json.loads(path.read_text())["seconds"]
 
 
-def best_clean(case, folder):
-    """The tclean run of the grid with the best model, and the parameters to do it again."""
-    tried = [run_clean(case, folder, weighting, setting) for weighting in WEIGHTINGS for setting in GRID]
+def best_clean(case, folder, known=None):
+    """The tclean run of the grid with the best model, or the known one, and the parameters to do it again."""
+    runs = [known] if known else [(weighting, setting) for weighting in WEIGHTINGS for setting in GRID]
+    tried = [run_clean(case, folder, weighting, setting) for weighting, setting in runs]
     best = max(tried, key=lambda result: result["raw"])
     sky, simulated = simulation_of(case, folder)
     parameters = common(case, sky, simulated, folder / "timed")
@@ -92,14 +93,14 @@ def run_wsclean(case, folder, weighting, sigma):
     return seconds, fits.getdata(f"{root}-model.fits").squeeze().T.astype(float)
 
 
-def scene(name, base, repeat):
+def scene(name, base, repeat, known):
     """Print the lines of one scene."""
     from casa_sara.demo.imagers import read_image
 
     case = Case(name)
     folder = base / case.folder
     sky, simulated = simulation_of(case, folder)
-    best, clean = best_clean(case, folder)
+    best, clean = best_clean(case, folder, known)
     sara = common(case, sky, simulated, "") | dict(weighting="briggs", robust=-1.0, nthreads=CORES)
     beam = [axis / float(sara["cell"].removesuffix("arcsec")) for axis in best["beam"][:2]], best["beam"][2]
     chosen = None
@@ -132,12 +133,13 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", nargs="+", default=["cyga", "M31", "W28"])
     parser.add_argument("--repeat", type=int, default=3)
+    parser.add_argument("--known", nargs=2, metavar=("WEIGHTING", "SETTING"), help="tclean's best")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     print(f"{machine()}\n\n| scene | imager | settings | s (least–greatest) | of tsara's time | SNR, dB | tsara's margin | at half beam "
           "| tsara's margin |\n" + "|---" * 9 + "|", flush=True)
     for name in options.scenes:
-        scene(name, options.folder.resolve(), options.repeat)
+        scene(name, options.folder.resolve(), options.repeat, options.known)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from casa_sara.sharing import Crew
 __all__ = ["basis_costs", "muster", "operator_costs"]
 
 DIRAC, WAVELET, TAP = 2.3, 3.3, 0.17  # of a pixel: the pixel basis, a wavelet, and more for each tap
-PIXEL, CELL, SAMPLE = 5.0, 22.0, 150.0  # of the operator and its adjoint: a pixel, a cell of the uv grid, a visibility
+PIXEL, CELL, SAMPLE = 8.1, 6.2, 132.0  # of the operator and its adjoint: a pixel, a cell of the uv grid, a visibility
 CELL_BYTES = 8
 ALIKE = 0.05  # times that differ by less are the same
 
