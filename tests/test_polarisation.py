@@ -8,6 +8,7 @@ casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara  # noqa: E402
 from casa_sara.casa.ms import read_visibilities  # noqa: E402
+from casa_sara.casa.skyimage import read_sky_image  # noqa: E402
 from casa_sara.options import Selection  # noqa: E402
 
 CELL_RAD = np.radians(1.0 / 3600)
@@ -129,3 +130,15 @@ def test_missing_correlations_are_refused(tmp_path, correlations, stokes, right)
     name = simulate(tmp_path / "x.ms", correlations=correlations, antennas=4, scans=1)
     with pytest.raises(ValueError, match=f"stokes = '{stokes}' cannot be formed from the correlations .*: it takes {right}"):
         read_visibilities(Selection((name,), datacolumn="data"), stokes=stokes)
+
+
+@pytest.mark.parametrize("stokes", ["Q", "V"])
+def test_a_comparison_refuses_images_of_another_stokes(tmp_path, stokes):
+    """Its visibilities are those of Stokes I."""
+    csys = casatools.coordsys().newcoordsys(direction=True, stokes=[stokes], spectral=True)
+    ia = casatools.image()
+    ia.fromshape(str(tmp_path / "a.model"), [16, 16, 1, 1], csys=csys.torecord())
+    ia.setbrightnessunit("Jy/pixel")
+    ia.close()
+    with pytest.raises(ValueError, match=f"models = '.*a.model' is of Stokes {stokes}: should be of Stokes I"):
+        read_sky_image(str(tmp_path / "a.model"), "models", ("Jy/pixel",))

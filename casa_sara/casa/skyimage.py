@@ -169,6 +169,9 @@ def _check_axes(name, parameter, shape, csys):
                          "ascension and declination")
     if int(np.prod(shape[2:])) != 1:
         raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one channel")
+    stokes = csys.stokes() if csys.findcoordinate("stokes")["return"] else ["I"]
+    if stokes[0] in ("Q", "U", "V"):
+        raise ValueError(f"{parameter} = '{name}' is of Stokes {stokes[0]}: should be of Stokes I, which it is held against")
 
 
 def beam_numbers(record):
