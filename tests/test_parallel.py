@@ -68,13 +68,16 @@ def alone(vis, folder):
 
 
 def _runs(vis, folder, **more):
-    """The runs that all numbers of ranks do: re-weighted, with hard bounds, and with equal blocks and uniform weights."""
+    """The runs that all numbers of ranks do: re-weighted; with hard bounds, equal blocks and uniform weights; and with w-term, spectrum, mask and
+    a block by name."""
     folder.mkdir(exist_ok=True)
     common = dict(vis=vis, **GRID, **more)
     return {
         "whole": dict(common, imagename=str(folder / "whole"), niter=125),
         "hard": dict(common, imagename=str(folder / "hard"), niter=12, nreweights=0, databound="weights", blocks=3,
                      weighting="uniform"),
+        "rich": dict(common, imagename=str(folder / "rich"), niter=12, gridder="wproject", spectralindex=-0.7,
+                     mask="circle[[30pix,34pix],18pix]", blocks=["scan=2"]),
     }
 
 
@@ -127,7 +130,8 @@ def two(vis, folder, alone):
     """Two ranks: the runs, a refusal that the job survives, and a run that is asked to stop."""
     runs = _runs(vis, folder / "two", parallel=True)
     stopped = dict(runs["whole"], imagename=str(folder / "two" / "stopped"))
-    steps = [["run", runs["whole"]], ["refused", runs["whole"]], ["run", runs["hard"]], ["stopped", stopped]]
+    steps = [["run", runs["whole"]], ["refused", runs["whole"]], ["run", runs["hard"]], ["stopped", stopped],
+             ["run", runs["rich"]]]
     return _mpirun(2, steps, folder)
 
 
@@ -143,7 +147,7 @@ def three(folder, two, vis, alone):
 def test_two_ranks_find_what_one_process_finds(two, alone, folder):
     done, said = two
     assert done.returncode == 0, done.stderr
-    for step, name in ((0, "whole"), (2, "hard")):
+    for step, name in ((0, "whole"), (2, "hard"), (4, "rich")):
         _same_findings(said[step], alone[name], 2)
         _same_images(folder / "two" / name, folder / "alone" / name)
     assert alone["whole"]["wild"] == [700] and len(alone["hard"]["bounds"]) == 3

@@ -80,8 +80,8 @@ PARAMETERS = (
 class _tsara:
     """Image MeasurementSets with SARA: sparse, positive, faithful to the data within the noise.
 
-    tsara reconstructs a continuum Stokes I image from visibilities, as tclean does, with SARA
-    instead of CLEAN. It looks for the sky that is sparsest in a set of bases together (the pixels
+    tsara reconstructs images of the sky from visibilities, continuum or cubes, as tclean does, with
+    SARA instead of CLEAN. It looks for the sky that is sparsest in a set of bases together (the pixels
     and eight Daubechies wavelets), nowhere negative, and in agreement with every block of
     visibilities to within its noise level. The solver is the adaptive preconditioned primal-dual
     algorithm of Dabbech et al. (2018), which also finds noise levels that the weights do not tell.
