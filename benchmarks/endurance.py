@@ -70,7 +70,8 @@ def long_solution(vis, iterations):
     from casa_sara.casa.ms import read_visibilities
     from casa_sara.options import ImageGrid, Selection, SolverOptions
     from casa_sara.reconstruction import reconstruct
-    from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
+    from casa_sara.snapshots import snapshot_blocks
+    from casa_sara.visibilities import sort_into_blocks
 
     data = read_visibilities(Selection((vis,), datacolumn="data"))
     data, offsets = sort_into_blocks(data, snapshot_blocks(data)[0])

@@ -233,7 +233,8 @@ def convergence(base, truth):
     from casa_sara.noise import noise_from_differences
     from casa_sara.options import ImageGrid, Selection, SolverOptions
     from casa_sara.reconstruction import reconstruct
-    from casa_sara.visibilities import snapshot_blocks, sort_into_blocks
+    from casa_sara.snapshots import snapshot_blocks
+    from casa_sara.visibilities import sort_into_blocks
 
     cell = BANDS["X"][1][0]
     selection = Selection(tuple(str(base / "X/data" / f"{config}.ms") for config in "ABCD"), datacolumn="data")

@@ -24,7 +24,7 @@ from casa_sara.injection import Injection, can_be_repeated, recover, spectral_in
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
-from casa_sara.visibilities import snapshot_blocks
+from casa_sara.snapshots import snapshot_blocks
 
 __all__ = ["compare_images"]
 

@@ -45,13 +45,14 @@ ROOMS = {
     },
     "resources": set(),
     "options": set(),
-    "visibilities": {"casa_sara.parallel", "numpy"},
+    "visibilities": {"numpy"},
+    "snapshots": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
     "noise": {"casa_sara.parallel", "casa_sara.sharing", "numpy"},
     "cautions": {"casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy"},
     "outliers": {"casa_sara.noise", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
     "casa": {
         "casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.parallel", "casa_sara.sharing",
-        "casa_sara.visibilities", "numpy", "scipy", *CASA,
+        "casa_sara.snapshots", "casa_sara.visibilities", "numpy", "scipy", *CASA,
     },
     "operators": {
         "casa_sara.options", "casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy", "finufft", "ducc0", "numba",
@@ -62,7 +63,7 @@ ROOMS = {
     "jsonfile": set(),
 }
 LIBRARY = (
-    "options", "parallel", "visibilities", "sharing", "balance", "noise", "cautions", "outliers", "problem", "operators", "solver",
+    "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "noise", "cautions", "outliers", "problem", "operators", "solver",
     "analysis",
 )
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}

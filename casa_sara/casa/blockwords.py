@@ -9,7 +9,7 @@ import numpy as np
 from casa_sara.casa.integrity import reading
 from casa_sara.casa.msselect import MSSELECT_KEYS, msselect
 from casa_sara.parallel import SERIAL
-from casa_sara.visibilities import snapshot_blocks
+from casa_sara.snapshots import snapshot_blocks
 
 __all__ = ["divide", "parsed"]
 
@@ -34,7 +34,7 @@ def divide(visibilities, blocks, comm=SERIAL):
     Returns
     -------
     block_of_sample, infos
-        As of :func:`casa_sara.visibilities.snapshot_blocks`; the blocks of the rest come first.
+        As of :func:`casa_sara.snapshots.snapshot_blocks`; the blocks of the rest come first.
 
     Raises
     ------

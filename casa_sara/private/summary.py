@@ -42,16 +42,7 @@ def summary(result, options, full: bool = False) -> dict[str, Any]:
     ends = _ends(result)
     code = record.stop_code if record else ITERATION_LIMIT
     minor = {"iterDone": ends, "peakRes": [result.residual_peak], "modelFlux": [result.model_flux]}
-    return {
-        "iterdone": ends[-1] if ends else 0,
-        "niter": options.niter,
-        "nmajordone": max(len(ends), 1),
-        "stopcode": code,
-        "stopDescription": STOP_DESCRIPTIONS[code],
-        "summarymajor": np.array(ends, int),
-        "summaryminor": {0: {0: {0: minor}}},
-        "sara": _sara(result, options, full),
-    }
+    return _outcome(options, ends, code, {0: {0: minor}}, _sara(result, options, full))
 
 
 def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
@@ -76,24 +67,30 @@ def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
             minor[number] = {0: _minor(channel.result, _stop_code(channel, result))}
             ends += [done + end for end in minor[number][0]["iterDone"]]
             done = ends[-1] if ends else 0
+    sara = {
+        "version": casa_sara.__version__,
+        "visibilities": result.data.size,
+        "dropped": dict(result.data.dropped),
+        "notes": list(result.data.notes),
+        "nthreads": options.nthreads,
+        "forecast": dict(result.forecast),
+        "outframe": result.frame,
+        "channels": [_channel(channel, _stop_code(channel, result), options, full) for channel in result.channels],
+    }
+    return _outcome(options, ends, result.stop_code, minor, sara)
+
+
+def _outcome(options, ends, code, minor, sara):
+    """Return tclean's dictionary; `ends` are the iterations at which the problems ended."""
     return {
-        "iterdone": done,
+        "iterdone": ends[-1] if ends else 0,
         "niter": options.niter,
         "nmajordone": max(len(ends), 1),
-        "stopcode": result.stop_code,
-        "stopDescription": STOP_DESCRIPTIONS[result.stop_code],
+        "stopcode": code,
+        "stopDescription": STOP_DESCRIPTIONS[code],
         "summarymajor": np.array(ends, int),
         "summaryminor": {0: minor},
-        "sara": {
-            "version": casa_sara.__version__,
-            "visibilities": result.data.size,
-            "dropped": dict(result.data.dropped),
-            "notes": list(result.data.notes),
-            "nthreads": options.nthreads,
-            "forecast": dict(result.forecast),
-            "outframe": result.frame,
-            "channels": [_channel(channel, _stop_code(channel, result), options, full) for channel in result.channels],
-        },
+        "sara": sara,
     }
 
 

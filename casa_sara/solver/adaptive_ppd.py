@@ -90,8 +90,6 @@ class AdaptivePPD:
         Σx and max x after the last step.
     unit_jy : float
         Jy/pixel in the unit of the model, for the record.
-    scratch_vis, scratch_image : complex (M,), real (nx, ny)
-        Work space between the steps, each of which overwrites it.
     """
 
     def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True,
@@ -122,12 +120,12 @@ class AdaptivePPD:
 
     @property
     def scratch_vis(self):
-        """Work space, complex (M,)."""
+        """Work space between the steps, complex (M,); each step overwrites it."""
         return self._phi_bar
 
     @property
     def scratch_image(self):
-        """Work space, real (nx, ny)."""
+        """Work space between the steps, real (nx, ny); each step overwrites it."""
         return self._data_gradient
 
     @property

@@ -22,7 +22,7 @@ from casa_sara.tasks.saracompare import PARAMETERS as OF_SARACOMPARE  # noqa: E4
 from casa_sara.tasks.tsara import PARAMETERS as OF_TSARA  # noqa: E402
 
 REFUSALS = (ValueError, TypeError, OSError, MemoryError)  # OSError: a path that is not there, or not to be written
-EXAMPLES, OF_SLOW = 4, 2
+EXAMPLES, OF_SLOW = 6, 2
 SLOW = ("outdir", "report")  # write a report
 LONGEST_S = 30  # of one call, which takes a fraction of a second: what takes longer hangs
 
