@@ -14,6 +14,7 @@ ABOVE_INSIDE = 1.5  # times the largest residual inside: calibration errors leav
 FAR_ABOVE = 3.0  # times the median of the other blocks
 FAR_ABOVE_WEIGHTS = 1.5  # times what the weights say
 SEEN, LOWEST, MAIN = 0.6, 0.05, 0.2  # of the shortest baseline's fringe; of the peak; of the flux
+BINS = 5  # in the standard deviation of a Gaussian
 FWHM = 2.3548200450309493  # of a Gaussian, in standard deviations
 
 
@@ -132,7 +133,8 @@ def beyond_baselines(model, cell_rad, shortest):
     A Gaussian of FWHM θ = 0.6/u has 28 % of its flux at the baseline u (exp(−(0.6π)²/4 ln 2)): of what is larger the
     data see less than that, and what the image has of it comes from the prior. Sources are the connected regions
     of the model, smoothed by θ/4, above 5 % of its peak, which hold 20 % of the flux at least; the size of one is 2.355
-    times its smaller standard deviation, so that one that is narrow in some direction passes.
+    times its smaller standard deviation, so that one that is narrow in some direction passes. Pixels are summed to bins of
+    a fifth of the smoothing's standard deviation first.
 
     Parameters
     ----------
@@ -146,8 +148,13 @@ def beyond_baselines(model, cell_rad, shortest):
     list of at most one str
     """
     largest = SEEN / shortest
+    smoothing = largest / 4 / FWHM
+    bins = [max(1, int(smoothing / cell / BINS)) for cell in cell_rad]
+    cell_rad = [cell * size for cell, size in zip(cell_rad, bins)]
     bright = np.abs(model)
-    smooth = gaussian_filter(bright, [largest / 4 / FWHM / cell for cell in cell_rad], mode="constant")
+    for axis, size in enumerate(bins):
+        bright = np.add.reduceat(bright, np.arange(0, bright.shape[axis], size), axis=axis)
+    smooth = gaussian_filter(bright, [smoothing / cell for cell in cell_rad], mode="constant")
     labels, count = label(smooth > LOWEST * smooth.max()) if bright.any() else (None, 0)
     for number in range(1, count + 1):
         pixels = np.nonzero(labels == number)
