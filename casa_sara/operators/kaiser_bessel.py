@@ -9,6 +9,8 @@ aliases lowest (Beatty et al. 2005).
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from scipy.optimize import brentq
 
@@ -48,6 +50,7 @@ def gain(width, sigma):
     return ends[0] / ends[1]
 
 
+@functools.cache
 def padding(width, eps, low=1.1, high=4.0):
     """Smallest σ ∈ [low, high] with which `width` cells reach the accuracy `eps`; inf if none does."""
     if alias_level(width, high) > eps:
