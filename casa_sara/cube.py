@@ -229,8 +229,7 @@ class _Cube:
 
     def _fill(self, k, data, blocks, noise, reconstruction, model):
         request, channel = self.request, self.channels[k]
-        found = plane_images(data, model, request.selection, request.grid, request.weighting, request.options,
-                             self.plane)
+        found = plane_images(data, model, request.grid, request.weighting, request.options, self.plane)
         for name, pixels in found.pixels.items():
             self.images[name][k] = pixels
         channel.sumwt, channel.beam = found.sumwt, found.beam

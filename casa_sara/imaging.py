@@ -162,7 +162,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
             data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
             offsets = np.searchsorted(reconstruction.kept, offsets)
         # write
-        images = plane_images(data, model, selection, grid, weighting, options, plane, comm)
+        images = plane_images(data, model, grid, weighting, options, plane, comm)
         doubtful = _look_back(images, support, reconstruction, Split(data, blocks, offsets, noise), grid, comm)
         result = Result(data, comm.total(data.size), blocks, noise, reconstruction, images.residual_peak, images.model_flux,
                         forecast.summary(), doubtful)
@@ -208,14 +208,14 @@ def split(data, blocks, comm=SERIAL):
     return Split(data, infos, offsets, noise)
 
 
-def plane_images(data, model, selection, grid, weighting, options, plane, comm=SERIAL):
+def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of."""
     weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the hands, too
         sumwt = float(weights.sum(dtype=float))
     else:
-        sumwt = sum_of_weights(data, selection, weights, grid.stokes)
+        sumwt = sum_of_weights(data, weights, grid.stokes)
     return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, comm.total(sumwt), beam)
 
 

@@ -14,8 +14,8 @@ class RowTable:
     """What is known of each MeasurementSet row that holds at least one sample, all (R,).
 
     `row` counts in its own MeasurementSet, `ms` numbers the MeasurementSets (in `vis`'s
-    order), `time` is the middle of the integration in MJD seconds (UTC) and `interval`
-    its length in seconds.
+    order), `time` is the middle of the integration in MJD seconds (UTC), `interval`
+    its length in seconds, and `hands` how many correlations a sample is formed of.
     """
 
     ms: np.ndarray
@@ -28,6 +28,7 @@ class RowTable:
     spw: np.ndarray
     antenna1: np.ndarray
     antenna2: np.ndarray
+    hands: np.ndarray
 
 
 @dataclass

@@ -90,7 +90,7 @@ def compare(vis, folder, shape, cell, weighting, selection, phasecenter=""):
     weights = imaging_weights(samples, grid, weighting)
     options = tuple(selection.items()) + (("phasecenter", phasecenter),)
     reference = tclean_dirty(vis if isinstance(vis, str) else names, folder, shape, cell, weighting, options)
-    result = {"sumwt": abs(sum_of_weights(samples, chosen, weights) / reference["sumwt"].item() - 1)}
+    result = {"sumwt": abs(sum_of_weights(samples, weights) / reference["sumwt"].item() - 1)}
     for product, data in (("psf", 1), ("residual", samples.vis)):
         result[product] = tuple(
             difference(dirty_image(MeasurementOperator(uv, grid.cell_rad, shape), data, weights), reference[product])

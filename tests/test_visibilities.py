@@ -25,7 +25,7 @@ def observation(scans, baselines=10, channels=1, interval=10.0, seed=0):
     shuffled = rng.permutation(columns["time"].size)
     columns = {name: values[shuffled] for name, values in columns.items()}
     rows = shuffled.size
-    rest = {name: np.zeros(rows, np.int32) for name in ("field", "spw")}
+    rest = {name: np.zeros(rows, np.int32) for name in ("field", "spw", "hands")}
     table = RowTable(row=np.arange(rows), interval=np.full(rows, interval), **rest, **columns)
     size = rows * channels
     return Visibilities(

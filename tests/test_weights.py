@@ -149,7 +149,7 @@ def test_nothing_is_written(names, tmp_path):
     vis, grid = read_visibilities(selection), grid_of((64, 64), 1.0)
     sampling_density(vis, selection, grid)
     imaging_weights(vis, grid, Weighting("briggs", 0.0, uvtaper=("2arcsec",)))
-    sum_of_weights(vis, selection, vis.imaging_weight)
+    sum_of_weights(vis, vis.imaging_weight)
     assert {name: digest(name) for name in names} == before
     assert os.listdir(tmp_path) == []
 
@@ -264,7 +264,7 @@ def test_sum_of_weights_counts_the_hands(names, tmp_path):
         selection = Selection(vis=(name,), datacolumn="data")
         vis = read_visibilities(selection)
         expected = hands * vis.imaging_weight.sum(dtype=float)
-        assert sum_of_weights(vis, selection, vis.imaging_weight) == pytest.approx(expected, rel=1e-6)
+        assert sum_of_weights(vis, vis.imaging_weight) == pytest.approx(expected, rel=1e-6)
 
 
 def test_dirty_image_is_the_plain_sum():

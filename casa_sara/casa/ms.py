@@ -31,7 +31,7 @@ _ROW_COLUMNS = {
 }
 _SAMPLE_DTYPES = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64, "row": np.int32,
                   "chan": np.int16, "freq_hz": np.float32}
-_ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64}
+_ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64, "hands": np.int8}
 
 
 def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, crew=ALONE):
@@ -235,7 +235,8 @@ class _SampleTable:
             new["freq_hz"] = geometry.frequencies(group, columns["field"], columns["time"])[ok]
         for name, values in new.items():
             self._samples[name].append(values.astype(_SAMPLE_DTYPES[name], copy=False))
-        of_group = {name: np.full(kept.size, value) for name, value in (("ms", ms.number), ("spw", group.spw))}
+        of_group = {name: np.full(kept.size, value)
+                    for name, value in (("ms", ms.number), ("spw", group.spw), ("hands", hands))}
         for name, values in (columns | of_group | {"row": chunk.rows}).items():
             self._rows[name].append(values[kept].astype(_ROW_DTYPES.get(name, np.int32)))
         self._rows_so_far += int(kept.sum())

@@ -127,14 +127,11 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     return weights
 
 
-def sum_of_weights(visibilities, selection, weights, stokes="I"):
+def sum_of_weights(visibilities, weights, stokes="I"):
     """tclean's `.sumwt`: each sample of Stokes I counts once for each parallel hand that it is the mean of."""
-    rows = visibilities.rows
-    hands = np.ones(rows.row.size)
-    for ms in select_data(selection)[0] if stokes == "I" else ():
-        for group in ms.groups:
-            hands[(rows.ms == ms.number) & np.isin(rows.row, group.rows)] = len(group.hands)
-    return float(np.dot(weights, hands[visibilities.row]))
+    if stokes != "I":
+        return float(weights.sum(dtype=float))
+    return float(np.dot(weights, visibilities.rows.hands[visibilities.row].astype(float)))
 
 
 def dirty_image(operator, vis, weights, comm=SERIAL):
