@@ -73,8 +73,15 @@ def test_the_dual_update_is_moreaus_complement_of_the_projection():
     shifted = dual / precond + point
     expected = precond * (shifted - project_ellipsoid(shifted, centre, precond, 2.0))
     multiplier = ellipsoid_multiplier(dual, point, centre, precond, 2.0)
-    kernels.update_dual(dual, point, centre, precond, np.ones(80), multiplier, 1.0, 0, 80)
+    anchor, norms_sq = np.zeros(80, complex), np.zeros(2)
+    model = 0.5 * (point + anchor)
+    pairs = [vis.view(float).reshape(-1, 2) for vis in (dual, point, anchor, centre)]
+    pieces = np.array([[0, 50, 0], [50, 80, 0]])
+    for worker in range(2):
+        kernels.data_step(*pairs, (precond, np.ones(80)), pieces, np.array([multiplier]), 1.0, norms_sq, worker, 2)
     np.testing.assert_allclose(dual, expected, rtol=1e-8)
+    np.testing.assert_allclose(anchor, model, rtol=1e-12)  # that of z + ρ(x − z), ρ = 1
+    np.testing.assert_allclose(norms_sq, [np.linalg.norm((centre - model)[part]) ** 2 for part in (slice(50), slice(50, 80))])
 
 
 def test_float32_projection_is_as_exact_as_single_precision_allows():

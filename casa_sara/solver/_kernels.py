@@ -7,16 +7,29 @@ _jit = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "arcp", "ns
 
 
 @_jit
-def residual_norm_sq(vis, phi_bar, phi_anchor, relaxation, start, stop):
-    """From Φx̄ and Φz, x̄ = 2x − z, return ‖y − Φx‖² of one block, and replace Φz by that of z + ρ(x − z)."""
-    total = 0.0
-    half = phi_bar.real.dtype.type(0.5)
-    for m in range(start, stop):
-        predicted = half * (phi_bar[m] + phi_anchor[m])
-        phi_anchor[m] += relaxation * (predicted - phi_anchor[m])
-        residual = vis[m] - predicted
-        total += residual.real**2 + residual.imag**2
-    return total
+def data_step(dual, phi_bar, phi_anchor, vis, weights, pieces, multipliers, relaxation, norms_sq, worker, workers):
+    """v ← v + ρ(ṽ − v), ṽ = U(s − z) = λ(v + U(Φx̄ − y))/(U + λ), and with x̄ = 2x − z replace Φz by that of z + ρ(x − z).
+
+    Visibilities are real pairs (M, 2), `weights` are U and the spread (M,); λ is the block's multiplier × spread. Each row of
+    `pieces` is the first sample, the last + 1 and the block of a piece, whose ‖y − Φx‖² goes to `norms_sq`.
+    """
+    precond, spread = weights
+    real = precond.dtype.type
+    for piece in range(worker, len(pieces), workers):
+        total, multiplier = 0.0, real(multipliers[pieces[piece, 2]])
+        for m in range(pieces[piece, 0], pieces[piece, 1]):
+            share = multiplier * spread[m]
+            step = relaxation * share / (precond[m] + share)
+            power = real(0)
+            for part in range(2):
+                predicted = real(0.5) * (phi_bar[m, part] + phi_anchor[m, part])
+                residual = vis[m, part] - predicted
+                power += residual * residual
+                phi_anchor[m, part] += relaxation * (predicted - phi_anchor[m, part])
+                ahead = dual[m, part] + precond[m] * (phi_bar[m, part] - vis[m, part])
+                dual[m, part] += step * ahead - relaxation * dual[m, part]
+            total += power
+        norms_sq[piece] = total
 
 
 @_jit
@@ -32,16 +45,6 @@ def shifted_norms(dual, phi_bar, vis, precond, multiplier, start, stop):
         norm_sq += power * shrunk * shrunk
         slope += power * shrunk * shrunk / (u + multiplier)
     return norm_sq, slope
-
-
-@_jit
-def update_dual(dual, phi_bar, vis, precond, spread, multiplier, relaxation, start, stop):
-    """v ← v + ρ(ṽ − v), ṽ = U(s − z) = λ(v + U(Φx̄ − y))/(U + λ), for one block; λ is multiplier × spread."""
-    for m in range(start, stop):
-        u = precond[m]
-        share = multiplier * spread[m]
-        projected = (share / (u + share)) * (dual[m] + u * (phi_bar[m] - vis[m]))
-        dual[m] += relaxation * (projected - dual[m])
 
 
 @_jit

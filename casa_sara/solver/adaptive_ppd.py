@@ -12,6 +12,7 @@ from casa_sara.solver.statefile import fill
 __all__ = ["BASIS_ARRAYS", "SAMPLE_ARRAYS", "AdaptivePPD"]
 
 RELAXATION = 1.8
+PIECE = 4096  # samples of a block that one thread works on: sums are the same for any number of threads
 STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor", "spread",
                 "multipliers", "residual_norms")
 SAMPLE_ARRAYS, BASIS_ARRAYS = ("l2_dual", "_phi_anchor", "spread"), ("l1_dual", "l1_weights")  # where ranks differ
@@ -111,7 +112,9 @@ class AdaptivePPD:
         self.l2_bounds = None
         self.begins, self.block_sizes = comm.place(np.diff(self.offsets))
         self.residual_norms = comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()]))
-        self._norms_sq = np.zeros(self.n_blocks)
+        self._pieces = np.array([(a, min(a + PIECE, stop), j) for j, (start, stop) in enumerate(self.blocks())
+                                 for a in range(start, stop, PIECE)], dtype=int).reshape(-1, 3)
+        self._piece_norms_sq, self._norms_sq = np.zeros(len(self._pieces)), np.zeros(self.n_blocks)
         self.rel_change = np.inf
         self.model_flux = self.model_max = 0.0
         self._sums, = comm.images(1, (measurement.shape[0], 4), float)
@@ -174,14 +177,16 @@ class AdaptivePPD:
         self.iteration += 1
 
     def _data_step(self):
-        args, real = (self.l2_dual, self._phi_bar, self.vis, self.precond), self.precond.dtype.type
-        relaxation = real(self.relaxation)
-        for j, (start, stop) in enumerate(self.blocks()):
-            self._norms_sq[j] = kernels.residual_norm_sq(self.vis, self._phi_bar, self._phi_anchor, relaxation, start, stop)
-            if self.l2_bounds is not None:
+        if self.l2_bounds is not None:
+            args = self.l2_dual, self._phi_bar, self.vis, self.precond
+            for j, (start, stop) in enumerate(self.blocks()):
                 self.multipliers[j] = ellipsoid_multiplier(*args, self.l2_bounds[j], self.multipliers[j], start, stop,
                                                            comm=self.comm)
-            kernels.update_dual(*args, self.spread, real(self.multipliers[j]), relaxation, start, stop)
+        pairs = [vis.view(self.precond.dtype).reshape(-1, 2)
+                 for vis in (self.l2_dual, self._phi_bar, self._phi_anchor, self.vis)]
+        self.measurement.workers.run(kernels.data_step, *pairs, (self.precond, self.spread), self._pieces, self.multipliers,
+                                     self.precond.dtype.type(self.relaxation), self._piece_norms_sq)
+        self._norms_sq[:] = np.bincount(self._pieces[:, 2], self._piece_norms_sq, self.n_blocks)
 
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.
