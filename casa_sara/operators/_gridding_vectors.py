@@ -15,7 +15,7 @@ from numba.core.datamodel import models
 from numba.extending import intrinsic, register_model
 
 __all__ = ["gather_rows", "load", "multiply", "multiply_add", "pair_sums", "polynomials", "scale_pairs", "scatter_rows",
-           "store", "zeros"]
+           "second_half_twice", "store", "zeros"]
 
 INT = ir.IntType(32)
 
@@ -41,13 +41,23 @@ def _pointer(context, builder, array_type, array, index, lanes):
     return builder.bitcast(builder.gep(data, [index]), context.get_value_type(lanes).as_pointer())
 
 
+def _lanes_of(builder, vector, pattern):
+    """The lanes of a vector with the numbers in `pattern`."""
+    return builder.shuffle_vector(vector, vector, ir.Constant(ir.VectorType(INT, len(pattern)), pattern))
+
+
+def _first_lanes(builder, values, vector):
+    """A vector whose first lanes are the given scalars."""
+    lanes = ir.Constant(vector, ir.Undefined)
+    for lane, value in enumerate(values):
+        lanes = builder.insert_element(lanes, value, INT(lane))
+    return lanes
+
+
 def _cycle(builder, values, vector):
     """The given scalars, again and again."""
-    undefined = start = ir.Constant(vector, ir.Undefined)
-    for lane, value in enumerate(values):
-        start = builder.insert_element(start, value, INT(lane))
     pattern = [lane % len(values) for lane in range(vector.count)]
-    return builder.shuffle_vector(start, undefined, ir.Constant(ir.VectorType(INT, len(pattern)), pattern))
+    return _lanes_of(builder, _first_lanes(builder, values, vector), pattern)
 
 
 def _multiply_add(builder, lanes, scalar, addend):
@@ -131,17 +141,37 @@ def pair_sums(typing_context, lanes):
 
 
 @intrinsic
-def polynomials(typing_context, coefs, t, terms, count):
-    """len(count) polynomials at t; `coefs` is (len(terms), len(count)) flattened, highest power first."""
-    lanes = Lanes(coefs.dtype, len(count))
+def polynomials(typing_context, coefs, first, second, terms, count):
+    """len(count)/2 polynomials at `first`, and the same at `second`.
+
+    `coefs` is (len(terms), len(count)/2) flattened, highest power first.
+    """
+    lanes, half = Lanes(coefs.dtype, len(count)), Lanes(coefs.dtype, len(count) // 2)
 
     def codegen(context, builder, signature, args):
-        offsets = [ir.IntType(64)(term * lanes.count) for term in range(len(terms))]
-        pointers = [_pointer(context, builder, coefs, args[0], offset, lanes) for offset in offsets]
-        rows = [builder.load(pointer, align=coefs.dtype.bitwidth // 8) for pointer in pointers]
-        return functools.reduce(lambda value, row: _multiply_add(builder, value, args[1], row), rows)
+        vector = context.get_value_type(lanes)
+        places = _lanes_of(builder, _first_lanes(builder, args[1:3], vector), [2 * lane // lanes.count for lane in range(lanes.count)])
+        twice = [lane % half.count for lane in range(lanes.count)]
+        offsets = [ir.IntType(64)(term * half.count) for term in range(len(terms))]
+        pointers = [_pointer(context, builder, coefs, args[0], offset, half) for offset in offsets]
+        rows = [_lanes_of(builder, builder.load(pointer, align=coefs.dtype.bitwidth // 8), twice) for pointer in pointers]
 
-    return lanes(coefs, coefs.dtype, terms, count), codegen
+        def one_more(value, row):
+            return builder.fadd(builder.fmul(value, places, flags=("contract",)), row, flags=("contract",))
+
+        return functools.reduce(one_more, rows)
+
+    return lanes(coefs, coefs.dtype, coefs.dtype, terms, count), codegen
+
+
+@intrinsic
+def second_half_twice(typing_context, lanes):
+    """Each lane of the second half twice: for the real and the imaginary part."""
+
+    def codegen(context, builder, signature, args):
+        return _lanes_of(builder, args[0], [(lanes.count + lane) // 2 for lane in range(lanes.count)])
+
+    return lanes(lanes), codegen
 
 
 def _rows(context, builder, array_type, args, lanes, width):
@@ -154,12 +184,12 @@ def _rows(context, builder, array_type, args, lanes, width):
 
 @intrinsic
 def gather_rows(typing_context, array, first, stride, factors, width):
-    """Σ_i factors[2i] · lanes at array[first + i·stride], i < len(width), of a contiguous 1-D array."""
+    """Σ_i factors[i] · lanes at array[first + i·stride], i < len(width), of a contiguous 1-D array."""
 
     def codegen(context, builder, signature, args):
         total = ir.Constant(args[3].type, None)
         for i, row in enumerate(_rows(context, builder, array, args, factors, len(width))):
-            factor = builder.extract_element(args[3], INT(2 * i))
+            factor = builder.extract_element(args[3], INT(i))
             total = _multiply_add(builder, builder.load(row, align=array.dtype.bitwidth // 8), factor, total)
         return total
 
@@ -168,12 +198,12 @@ def gather_rows(typing_context, array, first, stride, factors, width):
 
 @intrinsic
 def scatter_rows(typing_context, array, first, stride, factors, lanes, width):
-    """Add factors[2i] · lanes to array[first + i·stride …], i < len(width): the transpose of `gather_rows`."""
+    """Add factors[i] · lanes to array[first + i·stride …], i < len(width): the transpose of `gather_rows`."""
 
     def codegen(context, builder, signature, args):
         align = array.dtype.bitwidth // 8
         for i, row in enumerate(_rows(context, builder, array, args, factors, len(width))):
-            factor = builder.extract_element(args[3], INT(2 * i))
+            factor = builder.extract_element(args[3], INT(i))
             builder.store(_multiply_add(builder, args[4], factor, builder.load(row, align=align)), row, align=align)
         return context.get_dummy_value()
 

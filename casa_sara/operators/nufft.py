@@ -25,7 +25,7 @@ from numba import njit
 
 from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import (
-    gather_rows, multiply, pair_sums, polynomials, scale_pairs, scatter_rows)
+    gather_rows, multiply, pair_sums, polynomials, scale_pairs, scatter_rows, second_half_twice)
 
 __all__ = ["NonUniformFFT", "memory_size"]
 
@@ -158,7 +158,7 @@ class Points(NamedTuple):
 class Kernel(NamedTuple):
     """Polynomials of the place within a cell; the lengths of tuples are constants to the compiler."""
 
-    coefs: np.ndarray  # real, (len(terms), len(lanes)) flattened, each column twice: for real and imaginary parts
+    coefs: np.ndarray  # real, (len(terms), len(lanes)/2) flattened
     terms: tuple
     lanes: tuple
     width: tuple
@@ -166,12 +166,13 @@ class Kernel(NamedTuple):
 
 def _kernel(width, beta, dtype):
     polynomial = kaiser_bessel.kernel_polynomial(width, beta, width + 1)
-    coefs = np.zeros((len(polynomial), _lanes(width)), dtype)
-    coefs[:, : 2 * width] = np.repeat(polynomial, 2, axis=1)
-    return Kernel(coefs.ravel(), (0,) * len(coefs), (0,) * coefs.shape[1], (0,) * width)
+    coefs = np.zeros((len(polynomial), _lanes(width) // 2), dtype)
+    coefs[:, :width] = polynomial
+    return Kernel(coefs.ravel(), (0,) * len(coefs), (0,) * _lanes(width), (0,) * width)
 
 
 def _lanes(width):
+    """Reals in a row of `width` complex cells, rounded up to whole registers."""
     return 16 if width <= 8 else 32
 
 
@@ -231,8 +232,8 @@ def _clear(memory, worker, workers):
 def _interpolate(cells, stride, points, kernel, values, worker, workers):
     """values[point] = scales · Σ_rows kernel_0 Σ_columns kernel_1 · cells."""
     for p in range(points.order.size * worker // workers, points.order.size * (worker + 1) // workers):
-        down = polynomials(kernel.coefs, points.within[p, 0], kernel.terms, kernel.lanes)
-        along = polynomials(kernel.coefs, points.within[p, 1], kernel.terms, kernel.lanes)
+        down = polynomials(kernel.coefs, points.within[p, 0], points.within[p, 1], kernel.terms, kernel.lanes)
+        along = second_half_twice(down)
         real, imag = pair_sums(multiply(gather_rows(cells, points.first[p], stride, down, kernel.width), along))
         values[points.order[p], 0] = points.scales[p, 0] * real
         values[points.order[p], 1] = points.scales[p, 1] * imag
@@ -246,9 +247,8 @@ def _spread(cells, stride, points, kernel, pieces, values, worker, workers):
         cells[pieces[piece, 0] * stride + offset : pieces[piece, 1] * stride + offset] = 0
         for p in range(points.shares[piece], points.shares[piece + 1]):
             q = points.order[p]
-            down = polynomials(kernel.coefs, points.within[p, 0], kernel.terms, kernel.lanes)
-            along = polynomials(kernel.coefs, points.within[p, 1], kernel.terms, kernel.lanes)
-            row = scale_pairs(along, points.scales[p, 0] * values[q, 0], points.scales[p, 1] * values[q, 1])
+            down = polynomials(kernel.coefs, points.within[p, 0], points.within[p, 1], kernel.terms, kernel.lanes)
+            row = scale_pairs(second_half_twice(down), points.scales[p, 0] * values[q, 0], points.scales[p, 1] * values[q, 1])
             scatter_rows(cells, points.first[p] + offset, stride, down, row, kernel.width)
 
 
