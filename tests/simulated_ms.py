@@ -1,10 +1,11 @@
-"""Tiny simulated MeasurementSets for tests, with an exactly known sky, noise and weights.
+"""Tiny simulated MeasurementSets for tests, with an exactly known sky, noise and weights; and the pixels of images.
 
-    from simulated_ms import simulate, column, edit
+    from simulated_ms import simulate, column, edit, pixels
 
     name = simulate(tmp_path / "a.ms", sky=[(1.0, 0.0, 0.0), (0.5, 2e-5, -1e-5)], noise=0.02)
     flags = column(name, "FLAG")
     edit(name, "FLAG", lambda flag: flag | (flag.shape == 0))
+    model = pixels("image.model")
 
 A MeasurementSet of a few hundred rows takes about half a second. The casatools simulator lays
 out the observation (antennas, uvw, times, tables); the visibilities are predicted here with an
@@ -62,6 +63,16 @@ def edit(name, col, change):
             part.close()
     finally:
         tb.close()
+
+
+def pixels(name):
+    """Return the pixels (nx, ny) of the first plane of a CASA image."""
+    ia = _tool("image")
+    ia.open(str(name))
+    try:
+        return ia.getchunk()[:, :, 0, 0]
+    finally:
+        ia.close()
 
 
 def add_column(name, col, value, like="DATA"):

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_ms import edit, simulate
+from simulated_ms import edit, pixels, simulate
 
-casatools = pytest.importorskip("casatools")
+pytest.importorskip("casatools")
 
 import mpi_steps
 from casa_sara import tsara
@@ -98,21 +98,12 @@ def _mpirun(ranks, steps, folder):
     return done, said
 
 
-def _pixels(name, product):
-    ia = casatools.image()
-    ia.open(f"{name}.{product}")
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
-
-
 def _same_images(one, other, products=("model", "psf")):
     for product in products:
-        a, b = _pixels(one, product), _pixels(other, product)
+        a, b = (pixels(f"{name}.{product}") for name in (one, other))
         assert np.abs(a - b).max() <= AGREE * np.abs(b).max(), product
-    residuals = [_pixels(name, "residual") for name in (one, other)]
-    assert np.abs(residuals[0] - residuals[1]).max() <= AGREE * _pixels(other, "image").max()
+    residuals = [pixels(f"{name}.residual") for name in (one, other)]
+    assert np.abs(residuals[0] - residuals[1]).max() <= AGREE * pixels(f"{other}.image").max()
 
 
 def _same_findings(found, expected, ranks):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from simulated_ms import SPEED_OF_LIGHT, column, edit, simulate
+from simulated_ms import SPEED_OF_LIGHT, column, edit, pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
@@ -46,15 +46,6 @@ def observations(tmp_path_factory):
                                           noise=NOISE, scans=3, integration=20.0, spacing_seconds=5400.0, hour_angle=-2.0,
                                           spws=(("8.4GHz", "2MHz", 2),)))
             for feed, correlations in FEEDS.items()}
-
-
-def pixels(name):
-    ia = casatools.image()
-    ia.open(name)
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
 
 
 @pytest.mark.parametrize("feed", FEEDS)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_ms import edit, simulate
-from test_tsara import SKY, _hashes, _pixels
+from simulated_ms import edit, pixels, simulate
+from test_tsara import SKY, _hashes
 
 casatools = pytest.importorskip("casatools")
 
@@ -118,7 +118,7 @@ def names_in(folder):
 
 def assert_the_same(uninterrupted, name, result):
     for product in PRODUCTS:
-        np.testing.assert_array_equal(_pixels(f"{name}.{product}"), _pixels(f"{uninterrupted[1]}.{product}"))
+        np.testing.assert_array_equal(pixels(f"{name}.{product}"), pixels(f"{uninterrupted[1]}.{product}"))
     assert {key: result[key] for key in ("iterdone", "stopcode", "nmajordone")} == \
         {key: uninterrupted[0][key] for key in ("iterdone", "stopcode", "nmajordone")}
     histories = [jsonfile.load(f"{root}.sara.json")["history"] for root in (name, uninterrupted[1])]
@@ -148,9 +148,9 @@ def test_a_signal_delivers_the_best_image_and_a_checkpoint(uninterrupted, ended,
     folder, status, output = ended[moment]
     assert status == 0 and f"STOPPED WITH {STOPPED_BY_USER} 77" in output, output
     assert names_in(folder) == {"source.checkpoint", "source.sara.json", *(f"source.{product}" for product in PRODUCTS)}
-    model = _pixels(str(folder / "source.model"))
+    model = pixels(str(folder / "source.model"))
     assert model.sum() > 1
-    whole = _pixels(uninterrupted[1] + ".model")
+    whole = pixels(uninterrupted[1] + ".model")
     assert 0 < np.linalg.norm(model - whole) < 0.5 * np.linalg.norm(whole)
     with pytest.raises(FileExistsError, match="source.checkpoint'.*restart = True.*overwrite = True"):
         tsara(vis=vis, imagename=str(folder / "source"), **GRID)
@@ -216,8 +216,8 @@ def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, unint
     shutil.copytree(vis, moved)
     result = tsara(**(GRID | dict(vis=moved, imagename=stopped, restart=True, nthreads=2, weighting="uniform")))
     assert result["sara"]["resumed"] == [12] and not path.exists()
-    wanted = _pixels(uninterrupted[1] + ".model")
-    np.testing.assert_allclose(_pixels(stopped + ".model"), wanted, rtol=0, atol=1e-6 * wanted.max())
+    wanted = pixels(uninterrupted[1] + ".model")
+    np.testing.assert_allclose(pixels(stopped + ".model"), wanted, rtol=0, atol=1e-6 * wanted.max())
 
 
 def test_a_second_ctrl_c_aborts_at_once(vis, tmp_path, monkeypatch):

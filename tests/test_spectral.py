@@ -4,7 +4,7 @@ import os
 
 import numpy as np
 import pytest
-from simulated_ms import column, edit, simulate
+from simulated_ms import column, edit, pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
@@ -102,15 +102,6 @@ def vis(tmp_path_factory):
     edit(name, "WEIGHT", lambda weight: np.full_like(weight, 1e4))
     edit(name, "SIGMA", lambda sigma: np.full_like(sigma, 1e-2))
     return name
-
-
-def pixels(name):
-    ia = casatools.image()
-    ia.open(name)
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
 
 
 def fluxes(name):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from dense_problem import Problem
-from simulated_ms import simulate
+from simulated_ms import pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
@@ -25,15 +25,6 @@ BOX = "circle[[48pix,30pix],8pix]"
 def vis(tmp_path_factory):
     return simulate(tmp_path_factory.mktemp("ms") / "c.ms", configuration="c", antennas=14, sky=[INSIDE, OUTSIDE], noise=0.05,
                     scans=2, integration=20.0, spacing_seconds=5400.0, spws=(("8.4GHz", "2MHz", 2),), seed=4)
-
-
-def pixels(name):
-    ia = casatools.image()
-    ia.open(name)
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
 
 
 def tcleans_mask(vis, **mask):

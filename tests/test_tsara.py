@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from simulated_ms import edit, simulate
+from simulated_ms import edit, pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
@@ -50,18 +50,9 @@ def _hashes(folder):
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in Path(folder).rglob("*") if path.is_file()}
 
 
-def _pixels(name):
-    ia = casatools.image()
-    ia.open(name)
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
-
-
 def test_the_model_is_the_sky(run):
     result, name, *_ = run
-    model = _pixels(name + ".model")
+    model = pixels(name + ".model")
     assert result["stopcode"] == CONVERGED and result["stopDescription"] == "converged"
     assert model.min() > -0.02 * model.max()  # beside a bright source the bound may have given way
     assert model.sum() == pytest.approx(FLUX, rel=0.03)
@@ -74,11 +65,11 @@ def test_the_model_is_the_sky(run):
 def test_products_are_there_whole_and_finite(run):
     _, name, *_ = run
     for product in PRODUCTS:
-        assert np.isfinite(_pixels(f"{name}.{product}")).all(), product
+        assert np.isfinite(pixels(f"{name}.{product}")).all(), product
     assert sorted(path.name for path in Path(name).parent.iterdir()) == sorted([RECORD, *(f"source.{p}" for p in PRODUCTS)])
-    assert _pixels(name + ".psf").max() == pytest.approx(1.0, abs=1e-5)
+    assert pixels(name + ".psf").max() == pytest.approx(1.0, abs=1e-5)
     # restored image: the model in the beam and the residual; noise of the residual is the thermal one
-    residual = _pixels(name + ".residual")
+    residual = pixels(name + ".residual")
     assert residual.std() < 3 * run[0]["sara"]["chosen"]["noise_jy_per_beam"]
 
 
@@ -133,7 +124,7 @@ def test_the_image_scales_with_the_data(run, copy, tmp_path, factor):
     edit(copy, "DATA", lambda data: data * factor)
     edit(copy, "WEIGHT", lambda weight: weight / factor**2)
     tsara(vis=str(copy), imagename=str(tmp_path / "scaled"), **GRID)
-    model, scaled = _pixels(run[1] + ".model"), _pixels(str(tmp_path / "scaled.model"))
+    model, scaled = pixels(run[1] + ".model"), pixels(str(tmp_path / "scaled.model"))
     np.testing.assert_allclose(scaled / factor, model, atol=1e-4 * model.max())
 
 
@@ -143,7 +134,7 @@ def test_wrong_weights_are_found_out(copy, tmp_path, factor):
     result = tsara(vis=str(copy), imagename=str(tmp_path / "wrong"), **GRID)
     for block in result["sara"]["blocks"]:
         assert block["noise_found"] == pytest.approx(1 / factor, rel=0.1)
-    assert _pixels(str(tmp_path / "wrong.model")).sum() == pytest.approx(FLUX, rel=0.03)
+    assert pixels(str(tmp_path / "wrong.model")).sum() == pytest.approx(FLUX, rel=0.03)
 
 
 def test_noise_alone_gives_an_almost_empty_image_and_says_so(copy, tmp_path):
@@ -153,7 +144,7 @@ def test_noise_alone_gives_an_almost_empty_image_and_says_so(copy, tmp_path):
     result = tsara(vis=str(copy), imagename=str(tmp_path / "noise"), **GRID)
     assert result["stopcode"] == NOISE_ONLY
     noise = result["sara"]["chosen"]["noise_jy_per_beam"]
-    assert _pixels(str(tmp_path / "noise.model")).max() < 4 * noise
+    assert pixels(str(tmp_path / "noise.model")).max() < 4 * noise
 
 
 @pytest.mark.parametrize("databound", ["weights", "fixed"])
@@ -170,8 +161,8 @@ def test_given_bounds_are_met(vis, tmp_path, databound):
 def test_niter_0_makes_dirty_images_and_a_limit_is_kept(vis, tmp_path):
     dirty = tsara(vis=vis, imagename=str(tmp_path / "dirty"), niter=0, **GRID)
     assert (dirty["iterdone"], dirty["stopcode"]) == (0, ITERATION_LIMIT)
-    assert not _pixels(str(tmp_path / "dirty.model")).any()
-    assert _pixels(str(tmp_path / "dirty.residual")).max() > 0.5
+    assert not pixels(str(tmp_path / "dirty.model")).any()
+    assert pixels(str(tmp_path / "dirty.residual")).max() > 0.5
     few = tsara(vis=vis, imagename=str(tmp_path / "few"), niter=15, **GRID)
     assert (few["iterdone"], few["stopcode"]) == (15, ITERATION_LIMIT)
 
@@ -186,9 +177,9 @@ def test_existing_products_are_refused_replaced_or_continued(run, vis, tmp_path)
     assert _hashes(tmp_path) == before
     continued = tsara(vis=vis, imagename=name, restart=True, niter=0, **GRID)
     assert continued["iterdone"] == 0
-    np.testing.assert_array_equal(_pixels(name + ".model"), _pixels(run[1] + ".model"))
+    np.testing.assert_array_equal(pixels(name + ".model"), pixels(run[1] + ".model"))
     tsara(vis=vis, imagename=name, overwrite=True, niter=0, **GRID)
-    assert not _pixels(name + ".model").any()
+    assert not pixels(name + ".model").any()
 
 
 def test_a_failed_run_leaves_the_old_products(run, vis, tmp_path, monkeypatch):
@@ -204,9 +195,9 @@ def test_a_failed_run_leaves_the_old_products(run, vis, tmp_path, monkeypatch):
 
 def test_start_model_is_used(run, vis, tmp_path):
     result = tsara(vis=vis, imagename=str(tmp_path / "warm"), startmodel=run[1] + ".model", niter=0, **GRID)
-    assert result["summaryminor"][0][0][0]["modelFlux"][0] == pytest.approx(float(_pixels(run[1] + ".model").sum()))
-    assert np.abs(_pixels(str(tmp_path / "warm.residual"))).max() == pytest.approx(
-        np.abs(_pixels(run[1] + ".residual")).max(), rel=1e-3)
+    assert result["summaryminor"][0][0][0]["modelFlux"][0] == pytest.approx(float(pixels(run[1] + ".model").sum()))
+    assert np.abs(pixels(str(tmp_path / "warm.residual"))).max() == pytest.approx(
+        np.abs(pixels(run[1] + ".residual")).max(), rel=1e-3)
 
 
 def test_without_restoration_there_is_no_restored_image(vis, tmp_path):
@@ -229,9 +220,9 @@ def test_the_model_column_holds_the_models_visibilities(copy, tmp_path):
 def test_several_measurement_sets_and_odd_sizes(vis, copy, tmp_path):
     name = str(tmp_path / "both")
     result = tsara(vis=[vis, str(copy)], imagename=name, imsize=[121, 250], cell=["0.5arcsec", "0.25arcsec"], datacolumn="data")
-    assert _pixels(name + ".model").shape == (121, 250)
+    assert pixels(name + ".model").shape == (121, 250)
     # the brighter point source: pixels 60 − l/cell, 125 + m/cell
-    assert _pixels(name + ".model")[80:89, 145:162].sum() == pytest.approx(1.0, rel=0.05)
+    assert pixels(name + ".model")[80:89, 145:162].sum() == pytest.approx(1.0, rel=0.05)
     assert {block["ms"] for block in result["sara"]["blocks"]} == {vis, str(copy)}
 
 
@@ -249,7 +240,7 @@ def test_ctrl_c_ends_with_the_best_image_so_far(vis, tmp_path, monkeypatch):
     monkeypatch.setattr(log, "Progress", Interrupting)
     result = tsara(vis=vis, imagename=str(tmp_path / "stopped"), **GRID)
     assert (result["stopcode"], result["iterdone"]) == (STOPPED_BY_USER, 12)
-    assert _pixels(str(tmp_path / "stopped.model")).sum() > 0.5
+    assert pixels(str(tmp_path / "stopped.model")).sum() > 0.5
 
 
 def test_coarse_cells_and_large_w_are_pointed_out(vis, tmp_path):
@@ -325,7 +316,7 @@ def test_bad_samples_are_dropped_and_counted(copy, tmp_path):
     edit(copy, "WEIGHT", lambda weight: np.where(np.arange(weight.shape[1]) == 9, -1.0, weight))
     result = tsara(vis=str(copy), imagename=str(tmp_path / "some"), niter=10, **GRID)
     assert sum(result["sara"]["dropped"].values()) == 2 + 3  # two samples, and a row of three channels
-    assert np.isfinite(_pixels(str(tmp_path / "some.image"))).all()
+    assert np.isfinite(pixels(str(tmp_path / "some.image"))).all()
 
 
 def test_wild_samples_are_left_out_named_and_counted(run, copy, tmp_path):
@@ -341,9 +332,9 @@ def test_wild_samples_are_left_out_named_and_counted(run, copy, tmp_path):
     assert sorted(sample["row"] for sample in sara["wild"]) == [10, 300]
     assert all(sample["amplitude_jy"] == pytest.approx(1e4, rel=1e-3) for sample in sara["wild"])
     assert {"antenna1", "antenna2", "time_mjd_s", "ms"} <= set(sara["wild"][0])
-    model, clean = _pixels(str(tmp_path / "wild.model")), _pixels(run[1] + ".model")
+    model, clean = pixels(str(tmp_path / "wild.model")), pixels(run[1] + ".model")
     assert np.linalg.norm(model - clean) < 0.05 * np.linalg.norm(clean)
-    residual, before = (_pixels(name + ".residual") for name in (str(tmp_path / "wild"), run[1]))
+    residual, before = (pixels(name + ".residual") for name in (str(tmp_path / "wild"), run[1]))
     assert residual.std() < 1.1 * before.std()
     assert sum(block["samples"] for block in sara["blocks"]) == run[0]["sara"]["visibilities"] - 2 == sara["visibilities"]
 

@@ -8,7 +8,7 @@ import tracemalloc
 import numpy as np
 import pytest
 import scipy.special
-from simulated_ms import CYGNUS_A, column, simulate
+from simulated_ms import CYGNUS_A, column, pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
@@ -169,15 +169,6 @@ def flat(vis, tmp_path_factory):
     """A short run without the w-term: its return dictionary and its name."""
     name = str(tmp_path_factory.mktemp("run") / "flat")
     return tsara(vis=vis, imagename=name, niter=150, **GRID), name
-
-
-def pixels(name):
-    ia = casatools.image()
-    ia.open(name)
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
 
 
 def source(image, radius=3):

@@ -13,7 +13,7 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import CYGNUS_A, column, edit  # noqa: E402
+from simulated_ms import CYGNUS_A, column, edit, pixels  # noqa: E402
 from spoiled import BROKEN, FAULTS, GRID, HOPELESS, ROW, SAMPLE, flag, observe, put  # noqa: E402
 
 from casa_sara import tsara  # noqa: E402
@@ -53,15 +53,6 @@ def contents(folder):
     """Return the hashes of the files of a MeasurementSet, without its locks."""
     files = (path for path in Path(folder).rglob("*") if path.is_file() and path.name != "table.lock")
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
-
-
-def pixels(name):
-    ia = casatools.image()
-    ia.open(str(name))
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
 
 
 def image(vis, folder, product="model", **changes):

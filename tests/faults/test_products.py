@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from machinery import fill, free_bytes, hashes, killed, read_only, run_script, small_disk
-from simulated_ms import simulate
+from simulated_ms import pixels, simulate
 
-casatools = pytest.importorskip("casatools")
+pytest.importorskip("casatools")
 
 from casa_sara import tsara
 from casa_sara.casa import products
@@ -49,12 +49,7 @@ def old(run):
 
 
 def model(name):
-    ia = casatools.image()
-    ia.open(f"{name}.model")
-    try:
-        return ia.getchunk()[:, :, 0, 0]
-    finally:
-        ia.close()
+    return pixels(f"{name}.model")
 
 
 def fills_the_disk(monkeypatch, disk, left):
