@@ -80,10 +80,10 @@ def test_report_has_every_section_and_picture(report):
         assert word in page.text
 
 
-def test_a_report_replaces_the_earlier_one_whole(tmp_path, monkeypatch):
+def test_a_report_replaces_the_earlier_one_whole(report, tmp_path, monkeypatch):
     """Pictures of the earlier report go, other files stay, and a report that fails changes nothing."""
     few = comparison(names=("one",), with_truth=False)
-    write_report(comparison(frames=FRAMES), tmp_path)
+    shutil.copytree(report.parent, tmp_path, dirs_exist_ok=True)
     (tmp_path / "mine.png").write_text("mine")
     (tmp_path / "differences.txt").write_text("mine")
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}

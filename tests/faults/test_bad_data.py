@@ -49,6 +49,18 @@ def flagged_model(vis, tmp_path_factory):
     return model
 
 
+@pytest.fixture(scope="module")
+def whole_model(vis, tmp_path_factory):
+    """The model of the data as they are."""
+    return image(vis, tmp_path_factory.mktemp("whole"))[0]
+
+
+@pytest.fixture(scope="module")
+def wide_residual(vis, tmp_path_factory):
+    """The dirty image of the data as they are, on 128 by 128 pixels."""
+    return image(vis, tmp_path_factory.mktemp("wide"), "residual", imsize=128, niter=0)[0]
+
+
 def contents(folder):
     """Return the hashes of the files of a MeasurementSet, without its locks."""
     files = (path for path in Path(folder).rglob("*") if path.is_file() and path.name != "table.lock")
@@ -149,30 +161,36 @@ def test_autocorrelations_are_left_out(tmp_path):
     assert_refused(name, tmp_path, "vis: .*autocorrelation", antenna="*&&&", imagename=str(tmp_path / "none"))
 
 
-def test_one_of_several_may_be_empty(vis, copy, tmp_path):
-    alone = image(vis, tmp_path)[0]
+def test_one_of_several_may_be_empty(vis, copy, whole_model, tmp_path):
     model, record = image([vis, copy], tmp_path, scan=["", "7"])
-    assert_same(model, alone)
+    assert_same(model, whole_model)
     assert any("scan = '7' leaves no rows" in note for note in record["notes"])
     flag(...)(copy)
     for names in ([vis, copy], [copy, vis]):
         model, record = image(names, tmp_path)
-        assert_same(model, alone)
+        assert_same(model, whole_model)
         assert any(f"no sample of '{copy}' can be used" in note for note in record["notes"])
     assert_refused([vis, copy], tmp_path, "scan = '9'.*; scan = '7'", scan=["9", "7"], imagename=str(tmp_path / "none"))
 
 
-def test_the_same_data_twice_are_refused(vis, tmp_path):
+def test_the_same_data_twice_are_refused(vis, whole_model, tmp_path):
     os.symlink(vis, tmp_path / "link.ms")
     assert_refused([vis, str(tmp_path / "link.ms")], tmp_path, "vis = .* twice", scan="1")
     apart = image([vis, vis], tmp_path, scan=["1", "2"])[0]
-    assert_same(apart, image(vis, tmp_path)[0])
+    assert_same(apart, whole_model)
+
+
+@pytest.fixture(scope="module")
+def model_of_two(vis, tmp_path_factory):
+    """The model of the data and of others, both of RR and LL."""
+    folder = tmp_path_factory.mktemp("two")
+    return image([vis, observe(folder / "other.ms", seed=5, correlations="RR LL")], folder)[0]
 
 
 @pytest.mark.parametrize("correlations", ["XX YY", "LL RR"])
-def test_other_polarisation_products_add_up(vis, tmp_path, correlations):
-    others = [observe(tmp_path / f"{k}.ms", seed=5, correlations=hands) for k, hands in enumerate(("RR LL", correlations))]
-    assert_same(image([vis, others[1]], tmp_path)[0], image([vis, others[0]], tmp_path)[0])
+def test_other_polarisation_products_add_up(vis, model_of_two, tmp_path, correlations):
+    other = observe(tmp_path / "other.ms", seed=5, correlations=correlations)
+    assert_same(image([vis, other], tmp_path)[0], model_of_two)
 
 
 def test_spectral_frames_add_up(vis, tmp_path):
@@ -266,11 +284,11 @@ def test_an_image_plane_that_cannot_hold_the_data_is_refused(vis, tmp_path, give
 
 
 @pytest.mark.parametrize("imsize", [[61, 67], [64, 63], [97, 3], [128, 101]], ids=str)
-def test_any_size_shows_the_same_sky(vis, tmp_path, imsize):
-    whole = image(vis, tmp_path, "residual", imsize=128, niter=0)[0]
+def test_any_size_shows_the_same_sky(vis, wide_residual, tmp_path, imsize):
     part = image(vis, tmp_path, "residual", imsize=imsize, niter=0)[0]
     x, y = (64 - n // 2 for n in imsize)
-    np.testing.assert_allclose(part, whole[x : x + imsize[0], y : y + imsize[1]], atol=2e-5 * whole.max())
+    seen = wide_residual[x : x + imsize[0], y : y + imsize[1]]
+    np.testing.assert_allclose(part, seen, atol=2e-5 * wide_residual.max())
     model = image(vis, tmp_path, imsize=imsize)[0]
     assert model.shape == tuple(imsize) and model.max() > 0
 
