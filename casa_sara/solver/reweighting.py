@@ -18,6 +18,7 @@ FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
 RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
+NEARLY = 2  # times as far as in the end may the bounds be from the residuals when the weights are settled
 USUAL = 9  # re-weightings that most data need
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
@@ -45,7 +46,7 @@ class Schedule:
     niter: int = 100_000
     nreweights: int = 20
     reweight_decay: float = 0.618
-    reweight_tol: float = 1e-2
+    reweight_tol: float = 5e-3
     reltol: float = 3e-4
     final_reltol: float = 3e-4
     interval: int = 30
@@ -202,7 +203,7 @@ def _renew_weights(ppd, bounds, schedule, stage):
     change = ppd.comm.lead([_relative(ppd.model, stage.previous)])[0]
     scale = FIRST_SCALE * schedule.reweight_decay**stage.k
     released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
-    if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:
+    if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd, NEARLY) and not released:
         return False
     stage.previous[...] = ppd.model
     if scale <= LAST_SCALE:
