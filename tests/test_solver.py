@@ -147,21 +147,33 @@ def test_bounds_adapt_by_the_papers_rule():
     samples, sums = np.array([50, 50]), np.ones(2)
     bounds = AdaptiveBounds(np.array([10.0, 10.0]), samples, sums, 9, floor=np.array([0.0, 9.5]), rel_change=1e-3,
                             tol=1e-2, step=0.5, min_interval=10)
-    problem = Problem(seed=8)
-    ppd = _ppd(problem)
+    ppd = _ppd(Problem(seed=8))
+    ppd.rel_change = 1e-2
+
+    def moved_at(iteration):
+        """Whether a bound moves in this iteration, or in those before."""
+        moved = False
+        for ppd.iteration in range(ppd.iteration + 1, iteration + 1):
+            moved |= bounds.adapt(ppd)
+        return moved
+
     ppd.residual_norms = np.array([20.0, 2.0])
-    ppd.rel_change, ppd.iteration = 1e-2, 50
-    assert not bounds.adapt(ppd)  # condition (i): the model still moves
+    assert not moved_at(50)  # condition (i): the model still moves
     ppd.rel_change = 1e-4
-    assert bounds.adapt(ppd)
-    np.testing.assert_allclose(bounds.l2_bounds, [15.0, 9.75])  # half way; the second towards its floor
-    ppd.iteration = 55
-    assert not bounds.adapt(ppd)  # condition (ii): too soon
-    ppd.iteration = 60
-    assert bounds.adapt(ppd)
-    np.testing.assert_allclose(bounds.l2_bounds, [17.5, 9.625])
-    ppd.residual_norms, ppd.iteration = bounds.l2_bounds * 1.005, 80
-    assert not bounds.adapt(ppd)  # condition (iii): within tolerance
+    assert moved_at(51)
+    np.testing.assert_allclose(bounds.l2_bounds, [15.0, 9.5])  # up half of the way; down all of it, to the floor
+    assert not moved_at(60)  # condition (ii): too soon
+    assert moved_at(61)
+    np.testing.assert_allclose(bounds.l2_bounds, [17.5, 9.5])
+    ppd.residual_norms = np.array([20.5, 2.0])
+    assert not moved_at(71)  # 2.5 % within 10 iterations
+    assert moved_at(72)
+    np.testing.assert_allclose(bounds.l2_bounds, [19.0, 9.5])
+    ppd.residual_norms = bounds.l2_bounds * 1.005
+    assert not moved_at(100)  # condition (iii): within tolerance
+    assert bounds.met_by(ppd)
+    ppd.residual_norms = bounds.l2_bounds * 1.015
+    assert not bounds.met_by(ppd) and bounds.met_by(ppd, slack=2)
 
 
 @pytest.mark.parametrize("start", [0.3, 1.0, 10.0])

@@ -13,6 +13,7 @@ import functools
 
 import numpy as np
 from scipy.optimize import brentq
+from scipy.special import i0
 
 __all__ = ["alias_level", "gain", "kernel", "kernel_polynomial", "kernel_shape", "padding", "transform"]
 
@@ -24,7 +25,7 @@ def kernel_shape(width, sigma):
 
 def kernel(t, beta):
     """φ(t), zero outside [−1, 1]."""
-    return np.where(np.abs(t) <= 1, np.i0(beta * np.sqrt(np.maximum(1 - t**2, 0))), 0) / np.i0(beta)
+    return np.where(np.abs(t) <= 1, i0(beta * np.sqrt(np.maximum(1 - t**2, 0))), 0) / i0(beta)
 
 
 def transform(xi, width, beta):
@@ -32,7 +33,7 @@ def transform(xi, width, beta):
     square = beta**2 - (np.pi * width * np.asarray(xi, dtype=np.float64)) ** 2
     r = np.sqrt(np.abs(square))
     inside = np.sinh(np.where(square > 0, r, 0)) / np.where(r > 0, r, 1)
-    return width * np.where(square > 0, inside, np.sinc(r / np.pi)) / np.i0(beta)
+    return width * np.where(square > 0, inside, np.sinc(r / np.pi)) / i0(beta)
 
 
 def alias_level(width, sigma):
