@@ -122,9 +122,9 @@ def named_suspects(blocks, doubtful):
     """Yield a line for the log about each of the `suspects`."""
     for one in doubtful:
         level = one["noise_measured"] if one["reason"] == "thermal noise" else one["noise_found"]
-        yield (f"suspect: block {one['block']}, {blocks[one['block']].label}: its {one['reason']} are {level:.3g} times what its "
-               f"weights say, {level / one['others']:.2g} times the median of the others; its bound allows for that, but flag it if "
-               "it is bad")
+        yield (f"suspect: block {one['block']}, {blocks[one['block']].label}: its {one['reason']} are {level:.3g} times "
+               f"what its weights say, {level / one['others']:.2g} times the median of the others; its bound allows for "
+               "that, but flag it if it is bad")
 
 
 def beyond_baselines(model, cell_rad, shortest):
@@ -164,6 +164,6 @@ def beyond_baselines(model, cell_rad, shortest):
             size = FWHM * np.sqrt(np.linalg.eigvalsh(np.cov(place, aweights=flux, ddof=0))[0])
             if size > largest:
                 arcsec = np.degrees([size, largest]) * 3600
-                return [f"the shortest baseline sees scales up to {arcsec[1]:.3g} arcsec (0.6 of its fringe), and the image holds a "
-                        f"source of {arcsec[0]:.3g}: its flux is not measured; data of shorter baselines would"]
+                return [f"the shortest baseline sees scales up to {arcsec[1]:.3g} arcsec (0.6 of its fringe), and the "
+                        f"image holds a source of {arcsec[0]:.3g}: its flux is not measured; data of shorter baselines would"]
     return []

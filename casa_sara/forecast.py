@@ -64,8 +64,8 @@ class Workload:
         writes, bases = crew.comm.rank == 0, len(options.wavelets)
         return cls(math.ceil(census.samples * crew.share), census.reach, grid.shape, grid.cell_rad,
                    len(crew.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
-                   options.precondition, report and writes, grid.gridder, census.max_w, bool(grid.spectralindex), band, channels,
-                   share, grid.masked, (census.samples, bases) if writes and crew.comm.size > 1 else (0, 0))
+                   options.precondition, report and writes, grid.gridder, census.max_w, bool(grid.spectralindex), band,
+                   channels, share, grid.masked, (census.samples, bases) if writes and crew.comm.size > 1 else (0, 0))
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""

@@ -39,7 +39,7 @@ class Injection:
 
 
 def can_be_repeated(one) -> bool:
-    """Tell whether the run that made an ImageSet can be repeated: it is tsara's without a mask, and the images say with what."""
+    """Tell whether the run of an ImageSet can be repeated: it is tsara's without a mask, and the images say with what."""
     masked = one.parameters.get("usemask", "user") != "user" or one.parameters.get("mask", "") not in ("", "[]", "['']")
     return one.parameters.get("taskname") == "tsara" and not masked
 
@@ -132,7 +132,8 @@ def _spectrum_at(x, y, data, grid):
     if grid.spectrum is None:
         return 1.0
     index = np.asarray(grid.spectrum.index)
-    return (data.freq_hz.astype(float) / grid.spectrum.reference_hz) ** float(index[round(x), round(y)] if index.ndim else index)
+    index = float(index[round(x), round(y)] if index.ndim else index)
+    return (data.freq_hz.astype(float) / grid.spectrum.reference_hz) ** index
 
 
 def _options(parameters, nthreads) -> SolverOptions:

@@ -137,7 +137,8 @@ class MPI(Serial):
         return [array, *(self._receive(*about[rank], rank) for rank in range(1, self.size))]
 
     def deal(self, arrays):
-        shape, dtype = self.broadcast([(array.shape, array.dtype.str) for array in arrays] if not self.rank else None)[self.rank]
+        kinds = [(array.shape, array.dtype.str) for array in arrays] if not self.rank else None
+        shape, dtype = self.broadcast(kinds)[self.rank]
         if self.rank:
             return self._receive(shape, dtype, 0)
         for rank in range(1, self.size):

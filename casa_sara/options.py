@@ -58,8 +58,9 @@ class Spectrum:
 class ImageGrid:
     """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
 
-    `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis are '', a
-    channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say where the model may be.
+    `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis are
+    '', a channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say where the
+    model may be.
     """
 
     shape: tuple[int, int]

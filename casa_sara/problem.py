@@ -69,7 +69,10 @@ class Problem:
 
     @classmethod
     def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None, support=None, comm=SERIAL):
-        """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`; measure its norm unless given."""
+        """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`.
+
+        Its norm is measured unless given.
+        """
         data = samples.data
         sqrt_weight = np.sqrt(data.weight)
         vis = data.vis * sqrt_weight

@@ -30,7 +30,7 @@ WRITER = 130_000_000  # bytes of the process that writes the images, while it wa
 
 
 def foresee(selection, grid, options, limits, comm=SERIAL):
-    """Share the work of a run among the ranks, and forecast the memory of this one, from the numbers of rows, channels and pixels.
+    """Share a run among the ranks, and forecast the memory of this one, from the numbers of rows, channels and pixels.
 
     Rank 0 says its own in the log. Flags are read only where the run would not fit with all samples.
 
@@ -129,6 +129,7 @@ def _time_lines(timing):
     channels = f" for each of {timing.channels} channels" if timing.channels > 1 else ""
     yield f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the data decide)"
     rows = {"reading": timing.reading, "building the operator": timing.building,
-            "one iteration of NNLS": timing.nnls_iteration, "one iteration": timing.iteration, "writing the images": timing.writing}
+            "one iteration of NNLS": timing.nnls_iteration, "one iteration": timing.iteration,
+            "writing the images": timing.writing}
     for name, seconds in rows.items():
         yield f"  {name:<26}{seconds:10.3f} s"

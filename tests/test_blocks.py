@@ -134,7 +134,8 @@ def test_what_is_suspect():
     # the noise of a whole MeasurementSet of one block, where nothing can be measured, against the others
     assert found_by([1, 1, 1, 4], [np.nan] * 4, ["a", "b", "c", "d"]) == [(3, "errors")]
     # thermal noise is compared over all of them
-    assert found_by([1, 1, 1, 1, 4, 4], [1, 1, 1, 1, 4, 4], ["a"] * 4 + ["b"] * 2) == [(4, "thermal noise"), (5, "thermal noise")]
+    found = found_by([1, 1, 1, 1, 4, 4], [1, 1, 1, 1, 4, 4], ["a"] * 4 + ["b"] * 2)
+    assert found == [(4, "thermal noise"), (5, "thermal noise")]
     assert found_by([7], [7], ["a"]) == []
     # far below what the weights say: three times the others, and still within the weights
     assert found_by([0.1, 0.1, 0.1, 0.4], [0.1, 0.1, 0.1, 0.4], ["a"] * 4) == []

@@ -82,7 +82,8 @@ def test_pieces(copied, monkeypatch):
     monkeypatch.setattr(modelcolumn, "_CHUNK", 50)
     write(copied)
     for number in (0, 1):
-        np.testing.assert_allclose(spectral_window(copied, "MODEL_DATA", number), spectral_window(copied, "DATA", number), atol=2e-6)
+        model, data = (spectral_window(copied, column, number) for column in ("MODEL_DATA", "DATA"))
+        np.testing.assert_allclose(model, data, atol=2e-6)
 
 
 def test_rows_without_uvw_get_no_model(copied):

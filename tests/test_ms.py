@@ -103,7 +103,8 @@ def assert_same_samples(vis, samples):
 
 @pytest.mark.parametrize(
     ("correlations", "hands"),
-    [("RR LL", (0, 1)), ("LL RR", (0, 1)), ("XX YY", (0, 1)), ("RR RL LR LL", (0, 3)), ("LL RL LR RR", (0, 3)), ("XX", (0,)), ("LL", (0,))],
+    [("RR LL", (0, 1)), ("LL RR", (0, 1)), ("XX YY", (0, 1)), ("RR RL LR LL", (0, 3)), ("LL RL LR RR", (0, 3)), ("XX", (0,)),
+     ("LL", (0,))],
 )
 def test_samples_equal_a_cell_by_cell_read(tmp_path, correlations, hands):
     rng = np.random.default_rng(1)
@@ -131,7 +132,8 @@ def test_samples_equal_a_cell_by_cell_read(tmp_path, correlations, hands):
 
 def test_dtypes_and_layout(observation):
     vis = read(observation)
-    dtypes = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64, "row": np.int32, "chan": np.int16}
+    dtypes = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64, "row": np.int32,
+              "chan": np.int16}
     for name, dtype in dtypes.items():
         array = getattr(vis, name)
         assert array.dtype == dtype and array.shape[-1] == vis.size and array.flags.c_contiguous
@@ -256,7 +258,8 @@ def test_rotation_between_frames_against_astropy(frame, tolerance):
     image = SkyCoord(5.1002, 0.7003, unit="rad", frame="fk5").transform_to(names[frame])
     expected = basis(image, "icrs") @ basis(field, "icrs").T
     me = casatools.measures()
-    centre = me.direction(frame, *({"unit": "rad", "value": float(angle)} for angle in (image.data.lon.rad, image.data.lat.rad)))
+    angles = image.data.lon.rad, image.data.lat.rad
+    centre = me.direction(frame, *({"unit": "rad", "value": float(angle)} for angle in angles))
     found = rotation_between(me.direction("J2000", "5.1rad", "0.7rad"), centre)
     np.testing.assert_allclose(found, expected, atol=tolerance)
     np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-13)
@@ -269,7 +272,8 @@ def test_lsrk_frequencies_against_the_ms_tool(observation):
     tool = casatools.ms()
     tool.open(observation)
     start = str(np.datetime64("1858-11-17T00:00:00.000") + np.timedelta64(round(vis.rows.time[0] * 1000), "ms"))
-    expected = tool.cvelfreqs(spwids=[0], fieldids=[0], mode="channel", outframe="LSRK", obstime=start.replace("-", "/").replace("T", "/"))
+    obstime = start.replace("-", "/").replace("T", "/")
+    expected = tool.cvelfreqs(spwids=[0], fieldids=[0], mode="channel", outframe="LSRK", obstime=obstime)
     tool.close()
     here = vis.rows.time[vis.row] == vis.rows.time[0]
     found = vis.uvw[0, here] / column(observation, "UVW")[0, vis.rows.row[vis.row[here]]] * SPEED_OF_LIGHT

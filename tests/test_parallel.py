@@ -68,8 +68,10 @@ def alone(vis, folder):
 
 
 def _runs(vis, folder, **more):
-    """The runs that all numbers of ranks do: re-weighted; with hard bounds, equal blocks and uniform weights; and with w-term, spectrum, mask and
-    a block by name."""
+    """The runs that all numbers of ranks do.
+
+    Re-weighted; with hard bounds, equal blocks and uniform weights; and with w-term, spectrum, mask and a block by name.
+    """
     folder.mkdir(exist_ok=True)
     common = dict(vis=vis, **GRID, **more)
     return {
@@ -87,7 +89,8 @@ def _mpirun(ranks, steps, folder):
     path.write_text(json.dumps(steps))
     environment = dict(os.environ, OMPI_ALLOW_RUN_AS_ROOT="1", OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1", OMP_NUM_THREADS="1",
                        PYTHONPATH=os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
-    over = ["--oversubscribe"] if "Open MPI" in subprocess.run(["mpirun", "--version"], capture_output=True, text=True).stdout else []
+    version = subprocess.run(["mpirun", "--version"], capture_output=True, text=True).stdout
+    over = ["--oversubscribe"] if "Open MPI" in version else []
     done = subprocess.run(["mpirun", *over, "-n", str(ranks), sys.executable, mpi_steps.__file__, str(path)], cwd=folder,
                           env=environment, capture_output=True, text=True, timeout=LIMIT)
     said = [{} for _ in steps]

@@ -23,8 +23,8 @@ GRIDS = {"vla": dict(imsize=[160, 150], cell="3.6arcsec"), "alma": dict(imsize=[
 def observations(tmp_path_factory):
     """A VLA observation at 8.4 GHz and one like ALMA's at 230 GHz, each of one bright source beside the centre."""
     folder = tmp_path_factory.mktemp("ms")
-    vla = simulate(folder / "vla.ms", antennas=10, noise=0.02, scans=1, fields=(CYGNUS_A,), integration=20.0, spws=(("8.4GHz", "2MHz", 1),),
-                   sky=[(1.0, 100 * ARCSEC, -60 * ARCSEC)])
+    vla = simulate(folder / "vla.ms", antennas=10, noise=0.02, scans=1, fields=(CYGNUS_A,), integration=20.0,
+                   spws=(("8.4GHz", "2MHz", 1),), sky=[(1.0, 100 * ARCSEC, -60 * ARCSEC)])
     places = ALMA[:, None] + 40 * np.random.default_rng(1).standard_normal((3, 10))
     alma = simulate(folder / "alma.ms", configuration=places, telescope="ALMA", correlations="XX YY", fields=(SOUTH,),
                     spws=(("230GHz", "10MHz", 2),), scans=1, integration=20.0, noise=0.02, sky=[(1.0, 5 * ARCSEC, 3 * ARCSEC)])

@@ -241,5 +241,6 @@ def test_a_coarse_start_model_keeps_its_flux_and_is_pointed_out(vis):
 def test_a_start_model_in_another_unit_is_refused_with_the_way_to_the_right_one(vis):
     tsara(vis=vis, imagename="x", niter=0, restoringbeam=["6arcsec", "4arcsec", "0deg"], **GRID)
     pixels_in_beam = f"{np.pi / (4 * np.log(2)) * 24:.3f}"
-    with pytest.raises(ValueError, match=f"startmodel = 'x.image' is in 'Jy/beam': it takes 'Jy/pixel'; divide it by {pixels_in_beam}"):
+    refused = f"startmodel = 'x.image' is in 'Jy/beam': it takes 'Jy/pixel'; divide it by {pixels_in_beam}"
+    with pytest.raises(ValueError, match=refused):
         tsara(vis=vis, imagename="y", niter=0, startmodel="x.image", **GRID)

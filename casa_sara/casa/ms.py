@@ -119,7 +119,7 @@ def _read_all(selected, image, pieces, frequencies):
 
 
 def _own_pieces(selected, crew):
-    """Return the rows of each group, in pieces, that this rank reads: of all pieces, in order, an equal share of the samples."""
+    """Return the rows of each group, in pieces, that this rank reads: an equal share of the samples, in order."""
     pieces = [((ms.number, number), rows, rows.size * group.channels.size)
               for ms in selected for number, group in enumerate(ms.groups) for rows in _pieces(group)]
     sizes = np.array([size for *_, size in pieces])

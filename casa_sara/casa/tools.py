@@ -37,5 +37,6 @@ def scratch_folder(shape):
         needed, free = 10 * math.prod(shape) + 2_000_000, shutil.disk_usage(folder).free
         if free < needed:
             raise OSError(errno.ENOSPC, f"the folder of temporary files, '{tempfile.gettempdir()}', has "
-                          f"{free / 1e6:.1f} MB left, and an image takes {needed / 1e6:.1f} MB: free some, or set TMPDIR to another folder")
+                          f"{free / 1e6:.1f} MB left, and an image takes {needed / 1e6:.1f} MB: free some, or set TMPDIR to "
+                          "another folder")
         yield folder

@@ -19,7 +19,6 @@ import numpy as np
 
 from casa_sara.casa.frames import SPEED_OF_LIGHT
 from casa_sara.casa.quantities import radians
-from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
 from casa_sara.casa.usable import IN_FLAGS
 from casa_sara.parallel import SERIAL

@@ -150,7 +150,8 @@ def polynomials(typing_context, coefs, first, second, terms, count):
 
     def codegen(context, builder, signature, args):
         vector = context.get_value_type(lanes)
-        places = _lanes_of(builder, _first_lanes(builder, args[1:3], vector), [2 * lane // lanes.count for lane in range(lanes.count)])
+        halves = [2 * lane // lanes.count for lane in range(lanes.count)]
+        places = _lanes_of(builder, _first_lanes(builder, args[1:3], vector), halves)
         twice = [lane % half.count for lane in range(lanes.count)]
         offsets = [ir.IntType(64)(term * half.count) for term in range(len(terms))]
         pointers = [_pointer(context, builder, coefs, args[0], offset, half) for offset in offsets]

@@ -82,7 +82,7 @@ class ModulatedOperator:
 
 
 def terms_needed(largest, eps, modified=False):
-    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`, whose rest is below eps for |c| ≤ largest."""
+    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`: the rest is below eps for |c| ≤ largest."""
     rest = 2 * (iv if modified else jv)(np.arange(MOST), largest)
     rest = np.cumsum(np.abs(rest)[::-1])[::-1]  # of the orders from k on
     return max(1, int(np.count_nonzero(rest > eps)))

@@ -175,7 +175,8 @@ def _check_stokes(parameters):
                                 ("savemodel", "none", "the model column holds what both parallel hands see of Stokes I"),
                                 ("report", False, "a report is of Stokes I")):
         if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = {right!r}")
+            raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = "
+                             f"{right!r}")
 
 
 def _blocks(parameters):
