@@ -1,6 +1,6 @@
 """How time and memory of a whole run grow with the image and with the data.
 
-    python benchmarks/scaling.py FOLDER [--picture scaling.png]
+    python benchmarks/scaling.py FOLDER [--picture scaling.png] [--only visibilities]
 
 One sky of 256² pixels (unresolved sources on extended emission) is observed by the VLA in four configurations. Images of 256² to
 4096² pixels are made of 10⁵ visibilities; images of 1024² of 10⁴ to 10⁷. Every run is `tsara` with defaults on two threads in a
@@ -103,6 +103,7 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--picture", type=Path)
     parser.add_argument("--most", type=float, default=1e7, help="visibilities")
+    parser.add_argument("--only", choices=("pixels", "visibilities"))
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     base, sky = options.folder.resolve(), scene_sky("points off pixels", CELL)
@@ -119,10 +120,13 @@ def main():
             with quiet(folder / "simulation.txt"):
                 observe(sky, folder, Array(observation, tuple("ABCD")), 35.0)
     print(machine())
-    curves = {"pixels": series("pixels", [n * n for n in PIXELS], (run(base / "1e5", vis["1e5"], n) for n in PIXELS)),
-              "visibilities": series("visibilities, 1024² pixels", [float(name) for name in vis],
-                                     (run(base / name, vis[name], 1024) for name in vis))}
-    if options.picture:
+    curves = {}
+    if options.only != "visibilities":
+        curves["pixels"] = series("pixels", [n * n for n in PIXELS], (run(base / "1e5", vis["1e5"], n) for n in PIXELS))
+    if options.only != "pixels":
+        curves["visibilities"] = series("visibilities, 1024² pixels", [float(name) for name in vis],
+                                        (run(base / name, vis[name], 1024) for name in vis))
+    if options.picture and len(curves) == 2:
         picture(options.picture, curves)
 
 

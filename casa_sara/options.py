@@ -122,7 +122,7 @@ class SolverOptions:
     l2bound: tuple[float, ...] = ()
     nreweights: int = 20
     reweightdecay: float = 0.618
-    reweighttol: float = 5e-3
+    reweighttol: float = 1e-2
     reltol: float = 3e-4
     finalreltol: float = 3e-4
     regscale: float = 1.0

@@ -59,7 +59,7 @@ PARAMETERS = (
     Parameter('l2bound', ('doubleVec',), [], 'Noise level of each block, as a multiple of what the weights say', minimum=1e-06, maximum=1000000.0, opener='databound', open_on=('fixed',)),
     Parameter('nreweights', ('int',), 20, 'Maximum number of re-weightings', minimum=0.0),
     Parameter('reweightdecay', ('double',), 0.618, 'Factor on the scale of the sparsity weights at each re-weighting', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
-    Parameter('reweighttol', ('double',), 0.005, 'Relative change of the model between re-weightings that ends them', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
+    Parameter('reweighttol', ('double',), 0.01, 'Relative change of the model between re-weightings that ends them', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
     Parameter('reltol', ('double',), 0.0003, 'Relative change of the model in one iteration that counts as converged', minimum=0.0, maximum=1.0),
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
@@ -461,10 +461,10 @@ class _tsara:
         The scale that separates penalised from freed coefficients shrinks by this factor each
         time. (omega of the paper.)
 
-    reweighttol : float, default 0.005
+    reweighttol : float, default 0.01
         Opened by nreweights = other than 0.
-        Re-weighting ends when one more changes the model by less than this, relatively. (The
-        varrho of the paper.)
+        Re-weighting ends when one more changes the model by less than this, relatively, from the
+        sixth on, or by less than half of it before. (The varrho of the paper.)
 
     reltol : float, default 0.0003
         Where every bound on the data is met too, the next re-weighting starts; otherwise after 30
@@ -596,7 +596,7 @@ class _tsara:
         restoration=True, restoringbeam=[], pbcor=False, niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
         mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
-        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.005,
+        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
         reltol=0.0003, finalreltol=0.0003, regscale=1.0, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='',
         fullsummary=False, report=False, restart=False, overwrite=False, savemodel='none', parallel=False,
     ):
