@@ -11,7 +11,7 @@ from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.nnls import nnls
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE
-from casa_sara.solver.reweighting import Schedule, solve
+from casa_sara.solver.reweighting import Schedule, _is_settled, solve
 
 
 def _ppd(problem, precond=None, threshold=0.2, **options):
@@ -174,6 +174,23 @@ def test_bounds_adapt_by_the_papers_rule():
     assert bounds.met_by(ppd)
     ppd.residual_norms = bounds.l2_bounds * 1.015
     assert not bounds.met_by(ppd) and bounds.met_by(ppd, slack=2)
+
+
+def test_when_one_more_reweighting_would_change_nothing():
+    """Half of the tolerance and bounds nearly met, at any time; or all of it and bounds met, from the sixth on."""
+    schedule, off = Schedule(reweight_tol=1e-2), 0.0
+
+    class Bounds:
+        def met_by(self, ppd, slack=1):
+            return off <= slack
+
+    def settled(k, change):
+        return _is_settled(None, Bounds(), schedule, k, change)
+
+    for off, at_half, at_all in ((0.5, True, True), (1.5, True, False), (2.5, False, False)):
+        assert [settled(4, 4.9e-3), settled(6, 9e-3)] == [at_half, at_all]
+    off = 0.0
+    assert not settled(5, 5.1e-3) and not settled(6, 1.1e-2)
 
 
 @pytest.mark.parametrize("start", [0.3, 1.0, 10.0])

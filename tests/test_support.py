@@ -220,6 +220,16 @@ def test_a_source_that_the_shortest_baseline_cannot_see_is_pointed_out():
     assert told(points + gaussian((26, 26))) == []  # 1 Jy of 17
 
 
+@pytest.mark.parametrize("finer", [1, 4, 10])
+def test_the_size_of_a_source_does_not_depend_on_the_pixels(finer):
+    """Pixels are summed to bins before sources are told apart and measured: here none, none, and 4 × 2."""
+    cell = (CELL_RAD / finer, 2 * CELL_RAD / finer)
+    axes = 30 * finer, 13 * finer  # 30 and 26 arcsec
+    model = gaussian(axes, (96 * finer, 50 * finer), (50 * finer, 22 * finer))
+    (words,) = beyond_baselines(model, cell, 0.6 / (20 * CELL_RAD))
+    assert float(words.split("a source of ")[1].split(":")[0]) == pytest.approx(25, rel=0.05)
+
+
 def test_a_coarse_start_model_keeps_its_flux_and_is_pointed_out(vis):
     """An image as a single dish's, 4 arcsec a pixel and of another size, of a source that no baseline sees."""
     common = dict(vis=vis, uvrange=">12klambda", **(GRID | dict(imsize=96)))
