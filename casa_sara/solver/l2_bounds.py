@@ -9,7 +9,6 @@ import numpy as np
 __all__ = ["AdaptiveBounds", "GivenBounds", "chi_square_bounds"]
 
 FEWEST, LARGEST_SHARE = 50, 0.98  # of samples that a mean is taken of; of calibration errors in the error of a block
-RECENT, SETTLED = 10, 0.02  # iterations, and the relative change of a residual norm over them that lets a bound move
 ARTEFACTS = 0.4  # how much harder the prior is where all error is calibration error
 
 
@@ -118,9 +117,9 @@ class GivenBounds(_NoiseLevels):
         """Nothing adapts; return False."""
         return False
 
-    def met_by(self, ppd, slack=1):
-        """Whether every block's residual is inside its bound, but for a relative 1e-3 × slack."""
-        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3 * slack)))
+    def met_by(self, ppd):
+        """Whether every block's residual is inside its bound, but for a relative 1e-3."""
+        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3)))
 
 
 @dataclass
@@ -129,8 +128,7 @@ class AdaptiveBounds(_NoiseLevels):
 
     A bound moves as in the paper: when the model has settled (σ < γ1), at least P iterations after its last
     move, and when the residual differs by more than γ2, by the fraction γ3 of the way to the residual norm μ_j.
-    Beyond the paper, μ_j must have changed by less than 2 % over 10 iterations, so that the swing after a re-weighting moves
-    nothing, and a bound falls all of the way.  It never falls below `floor`.
+    It never falls below `floor`.
 
     Parameters
     ----------
@@ -149,14 +147,12 @@ class AdaptiveBounds(_NoiseLevels):
     step: float = 0.618
     min_interval: int = 20
     _last_move: np.ndarray = field(init=False)
-    _recent: np.ndarray = field(init=False)
     _artefacts: float = field(init=False, default=0.0)
-    _changing = ("l2_bounds", "weight_sums", "_last_move", "_recent", "_artefacts")
+    _changing = ("l2_bounds", "weight_sums", "_last_move", "_artefacts")
 
     def __post_init__(self):
         self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
         self._last_move = np.zeros(len(self.l2_bounds), int)
-        self._recent = np.full((RECENT + 1, len(self.l2_bounds)), np.nan)
 
     @property
     def gradient_noise(self):
@@ -191,29 +187,25 @@ class AdaptiveBounds(_NoiseLevels):
         self._artefacts = float(np.average(shares, weights=self.l2_bounds**2))
 
     def adapt(self, ppd):
-        """Steps 7–10, after every iteration; return whether any bound moved."""
-        self._recent[ppd.iteration % len(self._recent)] = ppd.residual_norms
+        """Steps 7–10; return whether any bound moved."""
         if ppd.rel_change >= self.rel_change:
             return False
-        before = self._recent[(ppd.iteration + 1) % len(self._recent)]
-        settled = np.abs(ppd.residual_norms - before) < SETTLED * ppd.residual_norms
-        move = settled & (ppd.iteration - self._last_move >= self.min_interval) & self._off_target(ppd)
+        move = (ppd.iteration - self._last_move >= self.min_interval) & self._off_target(ppd)
         if not move.any():
             return False
         target = np.maximum(ppd.residual_norms, self.floor)
-        step = np.where(target < self.l2_bounds, 1.0, self.step)
-        self.l2_bounds = np.where(move, step * target + (1 - step) * self.l2_bounds, self.l2_bounds)
+        self.l2_bounds = np.where(move, self.step * target + (1 - self.step) * self.l2_bounds, self.l2_bounds)
         self._last_move[move] = ppd.iteration
         self.apply_to(ppd)
         return True
 
-    def met_by(self, ppd, slack=1):
-        """Whether no bound has further to go than slack × γ2: every block's residual agrees with its bound."""
-        return not np.any(self._off_target(ppd, slack))
+    def met_by(self, ppd):
+        """Whether no bound has further to go: every block's residual agrees with its bound."""
+        return not np.any(self._off_target(ppd))
 
-    def _off_target(self, ppd, slack=1):
+    def _off_target(self, ppd):
         """Condition (iii): blocks whose residual norm, or floor, is further than γ2 from the bound."""
-        return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > slack * self.tol * self.l2_bounds
+        return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > self.tol * self.l2_bounds
 
 
 def _amplitude_share(power, residual_power, comm):

@@ -18,8 +18,6 @@ FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
 RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
-NEARLY = 2  # times as far as in the end may the bounds be from the residuals when the weights have well settled
-FEWEST = 6  # re-weightings, unless they settle well before
 USUAL = 9  # re-weightings that most data need
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
@@ -37,8 +35,7 @@ class Schedule:
     reweight_decay : float
         ω, factor on the scale of the weights.
     reweight_tol : float
-        ϱ: two re-weighted solutions that differ by less end the re-weighting, from the sixth on; by less than half of it,
-        before too.
+        ϱ: two re-weighted solutions that differ by less end the re-weighting.
     reltol, final_reltol : float
         Relative change that ends one ℓ1 problem, and the last one.
     interval : int
@@ -205,7 +202,7 @@ def _renew_weights(ppd, bounds, schedule, stage):
     change = ppd.comm.lead([_relative(ppd.model, stage.previous)])[0]
     scale = FIRST_SCALE * schedule.reweight_decay**stage.k
     released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
-    if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, stage.k, change):
+    if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:
         return False
     stage.previous[...] = ppd.model
     if scale <= LAST_SCALE:
@@ -214,13 +211,6 @@ def _renew_weights(ppd, bounds, schedule, stage):
     stage.record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
                                           released=released))
     return True
-
-
-def _is_settled(ppd, bounds, schedule, k, change):
-    """Whether one more re-weighting would change nothing that the data can tell."""
-    if change < 0.5 * schedule.reweight_tol:
-        return bounds.met_by(ppd, NEARLY)
-    return k >= FEWEST and change < schedule.reweight_tol and bounds.met_by(ppd)
 
 
 def _damp(ppd, residual_norms):

@@ -54,7 +54,7 @@ PARAMETERS = (
     Parameter('databound', ('string',), 'adapt', 'How closely the model must fit each block of data', allowed=('adapt', 'weights', 'fixed')),
     Parameter('boundtol', ('double',), 0.01, 'Relative difference of residual and bound that counts as met', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('boundrelchange', ('double',), 0.01, 'Relative change of the model below which bounds may move', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
-    Parameter('boundstep', ('double',), 0.618, 'Fraction of the way to the residual that a bound rises', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
+    Parameter('boundstep', ('double',), 0.618, 'Fraction of the way to the residual that a bound moves', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('boundinterval', ('int',), 20, 'Fewest iterations between two moves of a bound', minimum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('l2bound', ('doubleVec',), [], 'Noise level of each block, as a multiple of what the weights say', minimum=1e-06, maximum=1000000.0, opener='databound', open_on=('fixed',)),
     Parameter('nreweights', ('int',), 20, 'Maximum number of re-weightings', minimum=0.0),
@@ -437,8 +437,8 @@ class _tsara:
 
     boundstep : float, default 0.618
         Opened by databound = 'adapt'.
-        The new bound is boundstep times the residual norm plus 1 - boundstep times the old bound,
-        where that is larger; a bound falls to the residual norm at once. (gamma_3 of the paper.)
+        The new bound is boundstep times the residual norm plus 1 - boundstep times the old bound.
+        (gamma_3 of the paper.)
 
     boundinterval : int, default 20
         Opened by databound = 'adapt'.
@@ -463,8 +463,8 @@ class _tsara:
 
     reweighttol : float, default 0.01
         Opened by nreweights = other than 0.
-        Re-weighting ends when one more changes the model by less than this, relatively, from the
-        sixth on, or by less than half of it before. (The varrho of the paper.)
+        Re-weighting ends when one more changes the model by less than this, relatively. (The
+        varrho of the paper.)
 
     reltol : float, default 0.0003
         Where every bound on the data is met too, the next re-weighting starts; otherwise after 30
