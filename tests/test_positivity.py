@@ -60,6 +60,32 @@ def test_nothing_is_released_where_positive_pixels_hold_the_data(offset, flux):
     assert not np.any(ppd.lowest)
 
 
+@pytest.mark.parametrize("beside, asks", [(0.001, False), (3.95, False), (4.05, True)])
+def test_a_source_nearby_explains_it(beside, asks):
+    """A negative source of 1, three pixels from one whose lobes of a quarter are too faint for it, or just bright enough."""
+    ppd, bounds, *_ = _case(0.0, -1.0)
+    ppd.model[...] = 0
+    ppd.model[12, 13] = beside
+    ppd.vis = ppd.vis + ppd.measurement.forward(ppd.model)  # the residual is that of the negative source alone
+    release = Release()
+    assert release.update(ppd, bounds) == 0
+    assert bool(release.state()["asked"][12, 10] < 0) == asks
+    released = release.update(ppd, bounds)
+    assert bool(ppd.lowest[12, 10] < 0) or not asks
+    assert released == 0 or beside > 0.01
+
+
+def test_what_fades_is_not_released_until_it_stays():
+    ppd, bounds, *_ = _case(0.5)
+    predicted = ppd.measurement.forward(ppd.model)
+    residual, release = ppd.vis - predicted, Release()
+    counts = []
+    for size in (1.0, 0.4, 0.16, 0.1):
+        ppd.vis = predicted + size * residual
+        counts.append(release.update(ppd, bounds))
+    assert counts[:3] == [0, 0, 0] and counts[3] > 0
+
+
 def test_without_positivity_nothing_changes():
     ppd, bounds, _, _ = _case(0.5)
     ppd.lowest[...] = -np.inf

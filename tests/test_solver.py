@@ -1,5 +1,7 @@
 """Algorithms 1 and 2 on dense matrices, against minimisers found in other ways."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from dense_problem import Problem
@@ -11,7 +13,7 @@ from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.nnls import nnls
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE
-from casa_sara.solver.reweighting import Schedule, solve
+from casa_sara.solver.reweighting import Schedule, _is_settled, solve
 
 
 def _ppd(problem, precond=None, threshold=0.2, **options):
@@ -162,6 +164,15 @@ def test_bounds_adapt_by_the_papers_rule():
     np.testing.assert_allclose(bounds.l2_bounds, [17.5, 9.625])
     ppd.residual_norms, ppd.iteration = bounds.l2_bounds * 1.005, 80
     assert not bounds.adapt(ppd)  # condition (iii): within tolerance
+
+
+def test_when_one_more_reweighting_would_change_nothing():
+    """The model by less than the tolerance and bounds met, or by less than half of it and bounds nearly met."""
+    schedule, ppd = Schedule(reweight_tol=1e-2), SimpleNamespace()
+    bounds = AdaptiveBounds(np.ones(2), np.array([50, 50]), np.ones(2), 1, tol=0.01)
+    for off, expected in ((0.0, [True, True, False]), (0.015, [True, False, False]), (0.025, [False] * 3)):
+        ppd.residual_norms = np.array([1.0, 1 + off])
+        assert [_is_settled(ppd, bounds, schedule, change) for change in (4.9e-3, 9.9e-3, 1.1e-2)] == expected
 
 
 @pytest.mark.parametrize("start", [0.3, 1.0, 10.0])

@@ -117,9 +117,9 @@ class GivenBounds(_NoiseLevels):
         """Nothing adapts; return False."""
         return False
 
-    def met_by(self, ppd):
-        """Whether every block's residual is inside its bound, but for a relative 1e-3."""
-        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3)))
+    def met_by(self, ppd, slack=1.0):
+        """Whether every block's residual is inside its bound, but for a relative 1e-3 × slack."""
+        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3 * slack)))
 
 
 @dataclass
@@ -199,13 +199,13 @@ class AdaptiveBounds(_NoiseLevels):
         self.apply_to(ppd)
         return True
 
-    def met_by(self, ppd):
-        """Whether no bound has further to go: every block's residual agrees with its bound."""
-        return not np.any(self._off_target(ppd))
+    def met_by(self, ppd, slack=1.0):
+        """Whether every block's residual agrees with its bound, to slack × γ2."""
+        return not np.any(self._off_target(ppd, slack))
 
-    def _off_target(self, ppd):
-        """Condition (iii): blocks whose residual norm, or floor, is further than γ2 from the bound."""
-        return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > self.tol * self.l2_bounds
+    def _off_target(self, ppd, slack=1.0):
+        """Condition (iii): blocks whose residual norm, or floor, is further than slack × γ2 from the bound."""
+        return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > slack * self.tol * self.l2_bounds
 
 
 def _amplitude_share(power, residual_power, comm):

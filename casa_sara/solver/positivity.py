@@ -14,9 +14,11 @@ from scipy.ndimage import binary_dilation, maximum_filter
 
 __all__ = ["Release"]
 
-SIGNIFICANT = 5.0  # standard deviations of the noise
+SIGNIFICANT = 3.0  # standard deviations of the noise
+PERSISTENT = 0.5  # of what was asked for before
 LOBE = 0.25  # deepest negative lobe of a shifted sinc: 0.217 of its peak
-REACH = 3  # pixels around
+REACH = 3  # pixels from a source to its lobes
+AROUND = 2  # pixels released around one that asks
 
 
 class Release:
@@ -26,13 +28,15 @@ class Release:
 
         g = Φ†UΣ⁻¹(y − Φx) / √(Σ_m U_m² w_m/σ_m²),
 
-    is noise of unit variance where the model is right.  A pixel at its lower bound asks to be released where g < −5.  Where
-    it asks in two calls one after the other (a model that still moves swings to either side), and up to 3 pixels around,
-    the lower bound becomes −0.25 × the brightest pixel within 3 pixels.  What was released once stays so.
+    is noise of unit variance where the model is right.  A pixel at its lower bound asks to be released where g < −3, and
+    where a lobe of the brightest pixel within 3 pixels, −0.25 × its value, would change the gradient there by more than g.
+    Where it asks in two calls one after the other, for at least half as much the second time (a model that still moves
+    swings to either side, and what it leaves fades), and up to 2 pixels around, the lower bound becomes that lobe.  What was
+    released once stays so.
     """
 
     def __init__(self):
-        self._wanted_before = np.zeros((), bool)
+        self._asked = np.zeros((), np.float32)  # g where a pixel asked in the last call, else 0
 
     def update(self, ppd, bounds):
         """Release what the residual of the present model asks for.
@@ -48,39 +52,44 @@ class Release:
         int
             Number of pixels with a negative lower bound that had none before.
         """
-        wanted = _wanted(ppd, bounds)
-        both, self._wanted_before = wanted & self._wanted_before, wanted
-        if not both.any():
-            return 0
-        around = binary_dilation(both, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
-        before = np.count_nonzero(ppd.lowest)
         lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
+        asked, before = _asked(ppd, bounds, lobes), self._asked
+        self._asked = asked
+        again = (before < 0) & (asked < PERSISTENT * before)
+        if not again.any():
+            return 0
+        around = binary_dilation(again, np.ones((2 * AROUND + 1, 2 * AROUND + 1), bool))
+        count = np.count_nonzero(ppd.lowest)
         ppd.comm.settle()  # all ranks of one machine have counted, and write the same
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around & (ppd.lowest < np.inf))
         ppd.comm.settle()
-        return int(np.count_nonzero(ppd.lowest) - before)
+        return int(np.count_nonzero(ppd.lowest) - count)
 
     def state(self):
         """Return what the next call depends on."""
-        return dict(wanted_before=self._wanted_before)
+        return dict(asked=self._asked)
 
     def set_state(self, state):
         """Take over what :meth:`state` has returned."""
-        self._wanted_before = np.array(state["wanted_before"])
+        self._asked = np.array(state["asked"])
 
 
-def _wanted(ppd, bounds):
-    """Which pixels ask to be released; bool (nx, ny)."""
+def _asked(ppd, bounds, lobes):
+    """The gradient g where a pixel asks to be released, 0 elsewhere; real (nx, ny)."""
     weights = ppd.precond * ppd.spread
     weights *= np.repeat(bounds.noise_weights.astype(weights.dtype), np.diff(ppd.offsets))
     image, vis = ppd.scratch_image, ppd.scratch_vis
+    # what a pixel of 1 changes in its gradient, Σ U w/σ², and the variance of the gradient, Σ U² w/σ²
     image.fill(0)
     image[0, 0] = 1
     ppd.measurement.forward(image, vis)
-    vis *= ppd.precond * weights
-    noise_sq = float(ppd.adjoint(vis, image)[0, 0])
+    power = weights * (vis.real**2 + vis.imag**2)
+    response = ppd.comm.total(float(power.sum(dtype=float)))
+    noise = math.sqrt(ppd.comm.total(float(np.vdot(power, ppd.precond))))
     ppd.measurement.forward(ppd.model, vis)
     np.subtract(ppd.vis, vis, out=vis)
     vis *= weights
     gradient = ppd.adjoint(vis, image)
-    return (gradient < -SIGNIFICANT * math.sqrt(noise_sq)) & (ppd.model <= ppd.lowest) & (ppd.lowest < np.inf)
+    gradient /= gradient.dtype.type(noise)
+    asks = (gradient < -SIGNIFICANT) & (lobes * (response / noise) > -gradient)
+    return gradient * (asks & (ppd.model <= ppd.lowest) & (ppd.lowest < np.inf))

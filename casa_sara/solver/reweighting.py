@@ -17,6 +17,7 @@ STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
 RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
+NEARLY = 2.0  # times their tolerance may bounds be off where the model changes by less than 1/2 of its own
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 USUAL = 9  # re-weightings that most data need
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
@@ -202,7 +203,7 @@ def _renew_weights(ppd, bounds, schedule, stage):
     change = ppd.comm.lead([_relative(ppd.model, stage.previous)])[0]
     scale = FIRST_SCALE * schedule.reweight_decay**stage.k
     released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
-    if scale <= LAST_SCALE and change < schedule.reweight_tol and bounds.met_by(ppd) and not released:
+    if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, change):
         return False
     stage.previous[...] = ppd.model
     if scale <= LAST_SCALE:
@@ -211,6 +212,12 @@ def _renew_weights(ppd, bounds, schedule, stage):
     stage.record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
                                           released=released))
     return True
+
+
+def _is_settled(ppd, bounds, schedule, change):
+    """Whether one more re-weighting would change nothing that the data can tell."""
+    slack = NEARLY if change < schedule.reweight_tol / NEARLY else 1.0
+    return change < schedule.reweight_tol and bounds.met_by(ppd, slack)
 
 
 def _damp(ppd, residual_norms):
