@@ -17,8 +17,7 @@ __all__ = ["Release"]
 SIGNIFICANT = 3.0  # standard deviations of the noise
 PERSISTENT = 0.5  # of what was asked for before
 LOBE = 0.25  # deepest negative lobe of a shifted sinc: 0.217 of its peak
-REACH = 3  # pixels from a source to its lobes
-AROUND = 2  # pixels released around one that asks
+REACH = 3  # pixels around
 
 
 class Release:
@@ -31,7 +30,7 @@ class Release:
     is noise of unit variance where the model is right.  A pixel at its lower bound asks to be released where g < −3, and
     where a lobe of the brightest pixel within 3 pixels, −0.25 × its value, would change the gradient there by more than g.
     Where it asks in two calls one after the other, for at least half as much the second time (a model that still moves
-    swings to either side, and what it leaves fades), and up to 2 pixels around, the lower bound becomes that lobe.  What was
+    swings to either side, and what it leaves fades), and up to 3 pixels around, the lower bound becomes that lobe.  What was
     released once stays so.
     """
 
@@ -58,7 +57,7 @@ class Release:
         again = (before < 0) & (asked < PERSISTENT * before)
         if not again.any():
             return 0
-        around = binary_dilation(again, np.ones((2 * AROUND + 1, 2 * AROUND + 1), bool))
+        around = binary_dilation(again, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
         count = np.count_nonzero(ppd.lowest)
         ppd.comm.settle()  # all ranks of one machine have counted, and write the same
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around & (ppd.lowest < np.inf))
