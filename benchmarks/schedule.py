@@ -27,21 +27,28 @@ from scenes import smoothed_truth
 WIDTH = 1.2  # of the beam, in fringes of the longest baseline
 
 
-def solved(case: Case, base: Path) -> dict:
-    """Image a case, and say what became of it."""
-    from casa_sara.analysis.metrics import smooth, snr
+def observed(case: Case, base: Path):
+    """Sky and simulation of a case, its data in blocks, their density and the grid: what the task's solver is given."""
     from casa_sara.casa.ms import read_visibilities
     from casa_sara.casa.weights import sampling_density
     from casa_sara.imaging import split
-    from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
-    from casa_sara.reconstruction import reconstruct
+    from casa_sara.options import ImageGrid, Output, Selection
 
     sky, simulated = simulation_of(case, base / case.folder)
     selection = Selection(tuple(simulated["vis"]), datacolumn="data")
     shape = tuple(common(case, sky, simulated, "")["imsize"])
     grid = ImageGrid(shape, 2 * (sky.cell_rad * sky.oversampling,))
     part = split(read_visibilities(selection), Output("").blocks)
-    density = sampling_density(part.data, selection, grid)
+    return sky, simulated, part, sampling_density(part.data, selection, grid), grid
+
+
+def solved(case: Case, base: Path) -> dict:
+    """Image a case, and say what became of it."""
+    from casa_sara.analysis.metrics import smooth, snr
+    from casa_sara.options import SolverOptions
+    from casa_sara.reconstruction import reconstruct
+
+    sky, simulated, part, density, grid = observed(case, base)
     found = reconstruct(part.data, part.offsets, density, grid, SolverOptions(nthreads=1), part.noise)
     ratio = found.l2_bounds / simulated["errors"]
     result = dict(iterations=found.record.iteration[-1], stop=found.record.stop_description, raw=snr(sky.truth(), found.model),

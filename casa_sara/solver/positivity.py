@@ -82,7 +82,9 @@ def _asked(ppd, bounds, lobes):
     image.fill(0)
     image[0, 0] = 1
     ppd.measurement.forward(image, vis)
-    power = weights * (vis.real**2 + vis.imag**2)
+    power = np.abs(vis)
+    power *= power
+    power *= weights
     response = ppd.comm.total(float(power.sum(dtype=float)))
     noise = math.sqrt(ppd.comm.total(float(np.vdot(power, ppd.precond))))
     ppd.measurement.forward(ppd.model, vis)
