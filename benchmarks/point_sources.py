@@ -2,8 +2,8 @@
 
     python benchmarks/point_sources.py FOLDER [--against BEFORE.json]
 
-The samples are those of observations of quality.py (made in FOLDER where they are not there); their visibilities are the exact sums of
-point sources and Gaussians at random places, with thermal noise and, in some scenes, gain errors of every antenna and block. The
+The samples are those of observations of quality.py (made in FOLDER where they are not there); their visibilities are the exact
+sums of point sources and Gaussians at random places, with thermal noise and, in some scenes, gain errors of every antenna and block. The
 solution is that of the task with defaults on one thread, two scenes at a time. SNRs are those of the model, smoothed to half
 of and to the whole beam, against the same Gaussians without pixels. A single scene goes up and down by a decibel or two with
 anything that changes; the means count. "First" scenes were looked at while the release from positivity was chosen, the "kept

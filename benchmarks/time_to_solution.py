@@ -5,9 +5,9 @@
 Scenes and settings are those of quality.py. The best tclean multiscale run of a scene is that of its five settings and two
 weightings whose model has the highest SNR to the truth; all ten are tried first, and their own spread is not counted against
 anybody; --known leaves the search out. wsclean (where it is installed) runs multiscale with Briggs −1 and natural weights, each
-with its automatic threshold at one and two times the noise and an automatic mask; its best is taken in the same way. Then the best runs and tsara take turns, every run
-in a new process: time is that of the call, reading and writing included, importing not. tclean runs with one and with two OpenMP
-threads, and the faster counts. SNR = 20 log10(‖truth‖/‖truth − model‖), of the models as they are and smoothed to half the
+with its automatic threshold at one and two times the noise and an automatic mask; its best is taken in the same way. Then the best
+runs and tsara take turns, every run in a new process: time is that of the call, reading and writing included, importing not.
+tclean runs with one and with two OpenMP threads, and the faster counts. SNR = 20 log10(‖truth‖/‖truth − model‖), of the models as they are and smoothed to half the
 beam of tclean.
 """
 

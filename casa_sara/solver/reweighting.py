@@ -17,7 +17,7 @@ STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
 RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
-NEARLY = 2.0  # times their tolerance may bounds be off where the model changes by less than 1/2 of its own
+NEARLY = 2.0  # bounds may be off by so many of their tolerances where the model changes by one of its own over this
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 USUAL = 9  # re-weightings that most data need
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
@@ -36,7 +36,7 @@ class Schedule:
     reweight_decay : float
         ω, factor on the scale of the weights.
     reweight_tol : float
-        ϱ: two re-weighted solutions that differ by less end the re-weighting.
+        ϱ: two re-weighted solutions that differ by less end the re-weighting, once the bounds are met.
     reltol, final_reltol : float
         Relative change that ends one ℓ1 problem, and the last one.
     interval : int

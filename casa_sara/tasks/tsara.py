@@ -463,8 +463,8 @@ class _tsara:
 
     reweighttol : float, default 0.01
         Opened by nreweights = other than 0.
-        Re-weighting ends when one more changes the model by less than this, relatively. (The
-        varrho of the paper.)
+        Re-weighting ends when one more changes the model by less than this, relatively, and every
+        bound is met, or nearly met where it is less than half of this. (The varrho of the paper.)
 
     reltol : float, default 0.0003
         Where every bound on the data is met too, the next re-weighting starts; otherwise after 30
