@@ -103,7 +103,7 @@ def floor_seconds(ppd, nthreads, repeat):
     moved = 3 * 4 * ppd.dictionary.n_coefs  # dual read and written, weights read
     moved += 4 * pixels * (3 * 2 + 4 + 3)  # x, z, x̄ read and written; gradients and lower bound; images of the operators
     moved += 2 * ppd.measurement._nufft.grid.nbytes
-    moved += samples * (8 * (2 + 4 + 1) + 4 * 2 + 2 * 28)  # Φx̄, Φz, v, y; U and spread; places, scales, order of both ways
+    moved += samples * (8 * (2 + 4 + 1) + 4 + 2 * 28)  # Φx̄, Φz, v, y; U; places, scales, order of both ways
     return max(moved / bandwidth(nthreads, repeat), filter_flops(ppd.model.shape, ppd.dictionary.wavelets) / peak(nthreads, repeat))
 
 

@@ -18,11 +18,11 @@ FREQUENCY = 4  # of a sample, where they are kept
 READING = 62  # chunks, and one column joined
 POINT = 28  # of the operator: NonUniformFFT's Points
 PLANNING = 64  # frequencies and factors, while the operator is built
-SOLVER = 52  # whitened data, density, preconditioner, dual, Φx̄, Φz, spread, weights
+SOLVER = 48  # whitened data, density, preconditioner, dual, Φx̄, Φz, weights
 PASSING = 12  # weights of a pass between the iterations
 WEIGHING = 30  # uv cells and densities
 SORTING = 12  # of a cube: channels of the samples, and their order
-CHECKPOINT = 20  # the dual, Φz and the spread
+CHECKPOINT = 16  # the dual and Φz
 # image planes, each 4 bytes a pixel
 PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
 NORM, NNLS, SOLVING, WRITING = 8, 4, 9, 10

@@ -256,8 +256,8 @@ def _bounds(ppd, nnls_norms, weights, noise, options):
         measured = np.asarray(noise) * np.sqrt(2.0 * samples)
         floor = np.fmax(floor, measured)
         start = np.where(np.isfinite(measured), np.sqrt(nnls_norms * measured), nnls_norms)
-    return AdaptiveBounds(start, **common, floor=floor, sample_weights=weights, rel_change=options.boundrelchange,
-                          tol=options.boundtol, step=options.boundstep, min_interval=options.boundinterval)
+    return AdaptiveBounds(start, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
+                          step=options.boundstep, min_interval=options.boundinterval)
 
 
 def _is_noise_only(ppd, bounds):

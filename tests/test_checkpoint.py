@@ -201,7 +201,7 @@ def solution(problem, adaptive):
     weights = np.abs(problem.measurement.matrix[:, 0]) ** 2
     common = dict(samples=np.diff(problem.offsets), weight_sums=np.add.reduceat(weights, problem.offsets[:-1]), n_bases=3)
     if adaptive:
-        return ppd, AdaptiveBounds(3 * problem.errors, **common, sample_weights=weights)
+        return ppd, AdaptiveBounds(3 * problem.errors, **common)
     return ppd, GivenBounds(1.02 * problem.errors, **common)
 
 
@@ -338,7 +338,7 @@ def test_a_state_that_does_not_fit_is_refused(sky, tmp_path):
     image(sky, path, 3)
     header, right = read(str(path))
     for room, name, value in [("ppd", "model", np.zeros((48, 40), np.float32)), ("ppd", "l2_dual", np.zeros(3, complex)),
-                              ("found", "left_out", "all"), ("stage", "record", {}), ("bounds", "weight_sums", None)]:
+                              ("found", "left_out", "all"), ("stage", "record", {}), ("bounds", "l2_bounds", None)]:
         wrong = right | {room: {key: entry for key, entry in right[room].items() if key != name or value is not None}}
         if value is not None:
             wrong[room][name] = value

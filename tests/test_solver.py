@@ -187,36 +187,6 @@ def test_noise_levels_are_found_from_any_start(start):
     np.testing.assert_allclose(bounds.noise, noise, rtol=0.1)
 
 
-@pytest.mark.parametrize("gain", [0.0, 0.05])
-def test_errors_are_shared_by_amplitude(gain):
-    """Gain errors on top of noise: s_m² is the variance of every sample, and the weights follow; noise alone stays even."""
-    problem, thermal = Problem(seed=16, samples=(4000, 5000)), 2.0
-    ppd, rng = _ppd(problem), np.random.default_rng(17)
-    ppd.model[...] = 40 * problem.truth
-    model_vis = problem.measurement.forward(ppd.model)
-    draws = rng.normal(size=(2, 9000)) + 1j * rng.normal(size=(2, 9000))
-    ppd.vis = model_vis + thermal * draws[0] + gain * np.sqrt(0.5) * np.abs(model_vis) * draws[1]
-    variance = thermal**2 + gain**2 * np.abs(model_vis) ** 2 / 2
-    norms = np.sqrt(np.add.reduceat(2 * variance, problem.offsets[:-1]))
-    samples, weights = np.diff(problem.offsets), np.full(9000, 0.1)
-    bounds = AdaptiveBounds(norms, samples, np.add.reduceat(weights, problem.offsets[:-1]), 3, sample_weights=weights)
-    bounds.share(ppd)
-    found = np.repeat(bounds.noise**2, samples) / ppd.spread
-    assert np.quantile(np.abs(found / variance - 1), 0.99) < 0.2
-    assert variance.max() / variance.min() > 3 or gain == 0
-    assert bounds.total_weight == pytest.approx(np.sum(weights / variance), rel=0.1)
-    calibration = np.mean(variance - thermal**2) / np.mean(variance)
-    plain = np.sqrt(bounds.total_weight / 3)
-    assert bounds.gradient_noise == pytest.approx((1 + 0.4 * calibration) * plain, rel=0.02)
-
-
-def test_without_sample_weights_errors_are_even():
-    problem = Problem(seed=16)
-    ppd = _ppd(problem)
-    AdaptiveBounds(problem.errors, np.diff(problem.offsets), np.ones(2), 3).share(ppd)
-    assert np.all(ppd.spread == 1)
-
-
 def test_chi_square_bounds_hold_the_noise_of_unit_weights():
     rng = np.random.default_rng(10)
     norms = np.linalg.norm(rng.normal(size=(2000, 200)), axis=1)  # 100 complex samples

@@ -7,19 +7,17 @@ _jit = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "arcp", "ns
 
 
 @_jit
-def data_step(dual, phi_bar, phi_anchor, vis, weights, pieces, multipliers, relaxation, norms_sq, worker, workers):
+def data_step(dual, phi_bar, phi_anchor, vis, precond, pieces, multipliers, relaxation, norms_sq, worker, workers):
     """v ← v + ρ(ṽ − v), ṽ = U(s − z) = λ(v + U(Φx̄ − y))/(U + λ), and with x̄ = 2x − z replace Φz by that of z + ρ(x − z).
 
-    Visibilities are real pairs (M, 2), `weights` are U and the spread (M,); λ is the block's multiplier × spread. Each row of
-    `pieces` is the first sample, the last + 1 and the block of a piece, whose ‖y − Φx‖² goes to `norms_sq`.
+    Visibilities are real pairs (M, 2), `precond` is U (M,), λ the block's multiplier. Each row of `pieces` is the first
+    sample, the last + 1 and the block of a piece, whose ‖y − Φx‖² goes to `norms_sq`.
     """
-    precond, spread = weights
     real = precond.dtype.type
     for piece in range(worker, len(pieces), workers):
         total, multiplier = 0.0, real(multipliers[pieces[piece, 2]])
         for m in range(pieces[piece, 0], pieces[piece, 1]):
-            share = multiplier * spread[m]
-            step = relaxation * share / (precond[m] + share)
+            step = relaxation * multiplier / (precond[m] + multiplier)
             power = real(0)
             for part in range(2):
                 predicted = real(0.5) * (phi_bar[m, part] + phi_anchor[m, part])

@@ -13,9 +13,9 @@ __all__ = ["BASIS_ARRAYS", "SAMPLE_ARRAYS", "AdaptivePPD"]
 
 RELAXATION = 1.8
 PIECE = 4096  # samples of a block that one thread works on: sums are the same for any number of threads
-STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor", "spread",
+STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor",
                 "multipliers", "residual_norms")
-SAMPLE_ARRAYS, BASIS_ARRAYS = ("l2_dual", "_phi_anchor", "spread"), ("l1_dual", "l1_weights")  # where ranks differ
+SAMPLE_ARRAYS, BASIS_ARRAYS = ("l2_dual", "_phi_anchor"), ("l1_dual", "l1_weights")  # where ranks differ
 STATE_VALUES = ("threshold", "rel_change", "iteration")
 
 
@@ -81,8 +81,6 @@ class AdaptivePPD:
         W, or None for ones.
     threshold : float
         κ, in the unit of the model: only the speed depends on it, but see :meth:`rescale`.
-    spread : real (M,)
-        λ_j of each sample relative to its block's, where multipliers are given: ones unless set.
     residual_norms : float (d,)
         μ_j of the model before the last step.
     rel_change : float
@@ -105,7 +103,6 @@ class AdaptivePPD:
         self._data_gradient, self._slots = np.zeros(measurement.shape, dtype), comm.slots(measurement.shape, dtype)
         self._prior_gradient = self._slots[comm.rank] if self._slots else np.zeros(measurement.shape, dtype)
         self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
-        self.spread = np.ones_like(precond)
         self.l1_dual, self.l1_weights = dictionary.allocate(), None
         self.threshold = 0.0
         self.multipliers = np.zeros(self.n_blocks)
@@ -184,7 +181,7 @@ class AdaptivePPD:
                                                            comm=self.comm)
         pairs = [vis.view(self.precond.dtype).reshape(-1, 2)
                  for vis in (self.l2_dual, self._phi_bar, self._phi_anchor, self.vis)]
-        self.measurement.workers.run(kernels.data_step, *pairs, (self.precond, self.spread), self._pieces, self.multipliers,
+        self.measurement.workers.run(kernels.data_step, *pairs, self.precond, self._pieces, self.multipliers,
                                      self.precond.dtype.type(self.relaxation), self._piece_norms_sq)
         self._norms_sq[:] = np.bincount(self._pieces[:, 2], self._piece_norms_sq, self.n_blocks)
 

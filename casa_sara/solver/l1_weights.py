@@ -14,7 +14,7 @@ DRAWN = 1 << 20  # random numbers at a time
 def band_noise(ppd, bounds, seed=20180404):
     """Standard deviation of the noise in every band of the dictionary, and of a pixel, in the unit of the model.
 
-    One realisation of the noise, weighted by 1/s_m² as the data are, is carried to the image and normalised by
+    One realisation of the noise, weighted by 1/σ_j² as the data are, is carried to the image and normalised by
     the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
     scratch space, and so do those of `ppd`.
 
@@ -35,7 +35,7 @@ def band_noise(ppd, bounds, seed=20180404):
     for j, (a, b) in enumerate(ppd.blocks() if ppd.vis.size else ()):
         here = ppd.begins[j], b - a, ppd.block_sizes[j]
         noise[a:b] = _normal(rng, *here) + 1j * _normal(rng, *here)
-        noise[a:b] *= np.sqrt(bounds.noise_weights[j] * ppd.spread[a:b])
+        noise[a:b] *= np.sqrt(bounds.noise_weights[j])
     image = ppd.adjoint(noise, ppd.scratch_image)
     image /= image.dtype.type(bounds.total_weight)
     coefs = ppd.dictionary.analysis(image, ppd.l1_weights)

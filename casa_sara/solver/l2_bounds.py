@@ -8,9 +8,6 @@ import numpy as np
 
 __all__ = ["AdaptiveBounds", "GivenBounds", "chi_square_bounds"]
 
-FEWEST, LARGEST_SHARE = 50, 0.98  # of samples that a mean is taken of; of calibration errors in the error of a block
-ARTEFACTS = 0.4  # how much harder the prior is where all error is calibration error
-
 
 def chi_square_bounds(samples, noise=1.0):
     """Bounds ε_j that hold the noise of each block with a margin of two standard deviations.
@@ -64,7 +61,7 @@ class _NoiseLevels:
     weight_sums: np.ndarray
     n_bases: int
     regscale: float = 1.0
-    _changing = ("l2_bounds", "weight_sums")
+    _changing = ("l2_bounds",)
 
     @property
     def noise(self):
@@ -110,9 +107,6 @@ class GivenBounds(_NoiseLevels):
         """Make the bounds hard constraints, from where the multipliers have led."""
         ppd.l2_bounds = self.l2_bounds
 
-    def share(self, ppd):
-        """The errors are as given: nothing to share among the samples."""
-
     def adapt(self, ppd):
         """Nothing adapts; return False."""
         return False
@@ -134,57 +128,24 @@ class AdaptiveBounds(_NoiseLevels):
     ----------
     floor : float (d,)
         Lowest bounds allowed.
-    sample_weights : float (M,), optional
-        w, in the units of the model.  Without them :meth:`share` does nothing.
     rel_change, tol, step, min_interval
         γ1, γ2, γ3, P.
     """
 
     floor: np.ndarray | float = 0.0
-    sample_weights: np.ndarray | None = None
     rel_change: float = 1e-2
     tol: float = 1e-2
     step: float = 0.618
     min_interval: int = 20
     _last_move: np.ndarray = field(init=False)
-    _artefacts: float = field(init=False, default=0.0)
-    _changing = ("l2_bounds", "weight_sums", "_last_move", "_artefacts")
+    _changing = ("l2_bounds", "_last_move")
 
     def __post_init__(self):
         self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
         self._last_move = np.zeros(len(self.l2_bounds), int)
 
-    @property
-    def gradient_noise(self):
-        """κ_g, up to 1.4 times as much where calibration errors, whose artefacts look like sources, prevail."""
-        return (1 + ARTEFACTS * self._artefacts) * super().gradient_noise
-
     def finish(self, ppd):
         """Nothing changes for the last problem."""
-
-    def share(self, ppd):
-        """Share the error of each block among its samples, by the amplitudes of the present model.
-
-        Thermal noise is the same in every whitened sample; calibration errors go with the amplitude:
-
-            s_m² = σ_j²·(1 − c_j + c_j·|Φx|_m²/⟨|Φx|²⟩_j),   σ_j²/s_m² → `ppd.spread`.
-
-        c_j, the share of the calibration errors, is what the residuals of the bright half of the samples (brighter than
-        the mean) have more than those of the faint half, for what they are brighter; 0 … 0.98.
-        """
-        if self.sample_weights is None:
-            return
-        model_vis = ppd.measurement.forward(ppd.model, ppd.scratch_vis)
-        shares = np.zeros(ppd.n_blocks)
-        for j, (start, stop) in enumerate(ppd.blocks()):
-            power = np.abs(model_vis[start:stop]) ** 2
-            shares[j] = _amplitude_share(power, np.abs(ppd.vis[start:stop] - model_vis[start:stop]) ** 2, ppd.comm)
-            if shares[j] > 0:
-                ppd.spread[start:stop] = 1 / (1 - shares[j] + shares[j] * power / ppd.comm.mean(power))
-            else:
-                ppd.spread[start:stop] = 1
-        self.weight_sums = ppd.comm.block_sums(self.sample_weights * ppd.spread, ppd.offsets)
-        self._artefacts = float(np.average(shares, weights=self.l2_bounds**2))
 
     def adapt(self, ppd):
         """Steps 7–10; return whether any bound moved."""
@@ -206,13 +167,3 @@ class AdaptiveBounds(_NoiseLevels):
     def _off_target(self, ppd, slack=1.0):
         """Condition (iii): blocks whose residual norm, or floor, is further than slack × γ2 from the bound."""
         return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > slack * self.tol * self.l2_bounds
-
-
-def _amplitude_share(power, residual_power, comm):
-    """Share of the residual power that is proportional to `power`, from its means over bright and faint samples."""
-    mean, brightness = comm.mean, comm.mean(power)
-    bright = power > brightness
-    if min(comm.total(np.count_nonzero(bright)), comm.total(np.count_nonzero(~bright))) < FEWEST:
-        return 0.0
-    slope = (mean(residual_power[bright]) - mean(residual_power[~bright])) / (mean(power[bright]) - mean(power[~bright]))
-    return float(np.clip(slope * brightness / mean(residual_power), 0, LARGEST_SHARE))

@@ -75,8 +75,7 @@ class Release:
 
 def _asked(ppd, bounds, lobes):
     """The gradient g where a pixel asks to be released, 0 elsewhere; real (nx, ny)."""
-    weights = ppd.precond * ppd.spread
-    weights *= np.repeat(bounds.noise_weights.astype(weights.dtype), np.diff(ppd.offsets))
+    weights = ppd.precond * np.repeat(bounds.noise_weights.astype(ppd.precond.dtype), np.diff(ppd.offsets))
     image, vis = ppd.scratch_image, ppd.scratch_vis
     # what a pixel of 1 changes in its gradient, Σ U w/σ², and the variance of the gradient, Σ U² w/σ²
     image.fill(0)

@@ -206,8 +206,6 @@ def _renew_weights(ppd, bounds, schedule, stage):
     if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, change):
         return False
     stage.previous[...] = ppd.model
-    if scale <= LAST_SCALE:
-        bounds.share(ppd)
     reweight(ppd, bounds, max(scale, LAST_SCALE))
     stage.record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
                                           released=released))
