@@ -45,6 +45,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     """Run the task on the ranks of a communicator, of which rank 0 alone writes; return the same on all."""
     log.info(f"casa_sara {casa_sara.__version__}")
     _check_stokes(parameters)
+    _check_method(parameters)
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
@@ -177,6 +178,19 @@ def _check_stokes(parameters):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = "
                              f"{right!r}")
+
+
+def _check_method(parameters):
+    """Raise on what the algorithm of the paper does not know, and say when it runs."""
+    method = parameters["method"]
+    if method == "tsara":
+        return
+    for name, right, reason in (("regscale", 1.0, "it has no noise that could weigh its prior"),
+                                ("parallel", False, "it runs in one process")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, or "
+                             "method = 'tsara'")
+    log.info(f"method = '{method}': Algorithms 1 and 2 of Dabbech et al. (2018), to the letter")
 
 
 def _blocks(parameters):
