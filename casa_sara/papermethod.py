@@ -14,7 +14,7 @@ from casa_sara.solver.l2_bounds import chi_square_bounds
 from casa_sara.solver.nnls import nnls
 from casa_sara.solver.paperprior import RELAXATION, PaperPrior
 
-__all__ = ["PAPER", "block_norms", "first_threshold", "paper_bounds", "paper_iteration"]
+__all__ = ["PAPER", "block_norms", "first_threshold", "paper_bounds", "paper_iteration", "paper_prior"]
 
 PAPER = "dabbech2018"  # the value of the task parameter `method`
 ROUNDING = 1e-5  # of ‖y_j‖: no first bound is less, in single precision
@@ -55,6 +55,11 @@ def block_norms(problem, problem_of, options, stopped):
     return np.array(norms)
 
 
+def paper_prior(dictionary, measurement):
+    """The prior of the paper on a dictionary."""
+    return PaperPrior(dictionary, measurement.workers, power_method)
+
+
 def paper_iteration(problem, dictionary, data_norm_sq, positivity):
     """Algorithm 1 for a problem, its prior and steps as in the paper.
 
@@ -70,7 +75,7 @@ def paper_iteration(problem, dictionary, data_norm_sq, positivity):
     -------
     AdaptivePPD
     """
-    prior = PaperPrior(dictionary, problem.measurement.workers, power_method)
+    prior = paper_prior(dictionary, problem.measurement)
     return AdaptivePPD(problem.measurement, prior, problem.vis, problem.samples.offsets, problem.precond, data_norm_sq,
                        positivity, RELAXATION)
 

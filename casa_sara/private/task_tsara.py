@@ -38,6 +38,7 @@ ARCSEC = math.pi / 180 / 3600
 
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
+    _check_method(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -45,7 +46,8 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     """Run the task on the ranks of a communicator, of which rank 0 alone writes; return the same on all."""
     log.info(f"casa_sara {casa_sara.__version__}")
     _check_stokes(parameters)
-    _check_method(parameters)
+    if parameters["method"] == "dabbech2018":
+        log.info("method = 'dabbech2018': Algorithms 1 and 2 of Dabbech et al. (2018), to the letter")
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
@@ -181,7 +183,7 @@ def _check_stokes(parameters):
 
 
 def _check_method(parameters):
-    """Raise on what the algorithm of the paper does not know, and say when it runs."""
+    """Raise on what the algorithm of the paper does not know."""
     method = parameters["method"]
     if method == "tsara":
         return
@@ -190,7 +192,6 @@ def _check_method(parameters):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, or "
                              "method = 'tsara'")
-    log.info(f"method = '{method}': Algorithms 1 and 2 of Dabbech et al. (2018), to the letter")
 
 
 def _blocks(parameters):

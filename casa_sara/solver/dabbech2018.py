@@ -15,7 +15,7 @@ from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPE
 
 __all__ = ["PaperBounds", "PaperSchedule", "PaperStage", "solve"]
 
-USUAL = 40  # iterations of one weighted problem, for forecasts
+USUAL = 250  # iterations of one weighted problem, for forecasts
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,8 @@ class PaperSchedule:
     varrho: float = 0.0
     reltol: float = 1e-5
     final_reltol: float = 1e-6
-    nnls_reltol: float = 5e-5
-    nnls_iterations: int = 500
+    nnls_reltol: float = 1e-6
+    nnls_iterations: int = 5000
     niter: int = 100_000
 
     @classmethod
