@@ -317,6 +317,8 @@ def test_a_reconstruction_is_kept_and_goes_on(blocks, tmp_path, monkeypatch):
     wanted = image(blocks)
     assert wanted.record.stop_code == CONVERGED and len(wanted.record.reweightings) == 5
     assert wanted.model.min() >= 0 and np.unravel_index(np.argmax(wanted.model), GRID.shape) == (12, 20)
+    whitened = blocks[0].vis * np.sqrt(blocks[0].weight)
+    assert wanted.record.residual_norm[0] == pytest.approx(np.linalg.norm(whitened), rel=1e-5)  # x⁽⁰⁾ = 0
     middle = wanted.record.reweightings[1]["iteration"] + 3
     assert image(blocks, tmp_path / "c", middle).record.stop_code == STOPPED_BY_USER
     monkeypatch.setattr("casa_sara.papermethod.nnls", None)  # not needed any more
@@ -338,7 +340,7 @@ def test_given_bounds_are_hard_constraints(blocks, databound, l2bound, noise):
 ARCSEC = np.radians(1 / 3600)
 SKY = [(1.0, -12 * ARCSEC, 7 * ARCSEC), (0.4, 9 * ARCSEC, -10 * ARCSEC)]
 SKY += [(0.02, x * ARCSEC, y * ARCSEC) for x in range(-4, 5, 2) for y in range(-4, 5, 2)]
-GOOD = dict(imsize=64, cell="1arcsec", datacolumn="data", method="dabbech2018")
+GOOD = dict(imsize=64, cell="1arcsec", datacolumn="data", method="dabbech2018", nthreads=1)
 
 
 @pytest.fixture(scope="module")
@@ -370,6 +372,8 @@ def test_the_task_images_with_the_paper(vis, tmp_path, caplog):
     sara = result["sara"]
     assert result["stopcode"] == CONVERGED and len(sara["reweightings"]) == 8 and sara["method"] == "dabbech2018"
     np.testing.assert_allclose([update["scale"] for update in sara["reweightings"]], 0.8 ** np.arange(1, 9))
+    # κ is 1e-5 of the brightest pixel of the first image, which is within a factor of that of the last
+    assert 1e-6 < sara["chosen"]["threshold_jy_per_pixel"] / model.max() < 2e-5
     assert "noise" not in sara["why"]["threshold_jy_per_pixel"]
     assert all(block["noise_found"] == pytest.approx(1.0, rel=0.1) for block in sara["blocks"])
     assert "method = 'dabbech2018'" in (tmp_path / "casa.log").read_text()
