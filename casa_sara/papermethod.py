@@ -46,8 +46,8 @@ def block_norms(problem, problem_of, options, stopped):
             norms.append(0.0)
             continue
         chosen = np.arange(start, stop)
-        block = problem_of(Samples(samples.data.take(chosen), np.array([0, stop - start]), samples.density[chosen], chosen),
-                           options=plain)
+        alone = Samples(samples.data.take(chosen), np.array([0, stop - start]), samples.density[chosen], chosen)
+        block = problem_of(alone, options=plain)
         _, residual = nnls(block.measurement, block.vis, block.precond, block.data_norm_sq, schedule.nnls_iterations,
                            last_penalty=0, positivity=options.positivity, stopped=stopped, support=block.support,
                            reltol=schedule.nnls_reltol)
@@ -81,7 +81,7 @@ def paper_iteration(problem, dictionary, data_norm_sq, positivity):
 
 
 def paper_bounds(ppd, nnls_norms, weights, options):
-    """The bounds: from NNLS, and adapted, or what weights or l2bound say, and fixed, as where the noise is known (section 3).
+    """The bounds: from NNLS, and adapted; or what the weights or l2bound say, and fixed, for known noise (section 3).
 
     Parameters
     ----------

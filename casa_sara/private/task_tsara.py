@@ -190,8 +190,8 @@ def _check_method(parameters):
     for name, right, reason in (("regscale", 1.0, "it has no noise that could weigh its prior"),
                                 ("parallel", False, "it runs in one process")):
         if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, or "
-                             "method = 'tsara'")
+            raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, "
+                             "or method = 'tsara'")
 
 
 def _blocks(parameters):

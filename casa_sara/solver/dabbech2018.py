@@ -1,7 +1,7 @@
 """Algorithms 1 and 2 of Dabbech et al. 2018 to the letter: hard ℓ2 bounds that adapt, and weights that fall with ω^k.
 
-The task runs them with ``method='dabbech2018'``.  One iteration is that of :mod:`casa_sara.solver.adaptive_ppd` with ρ = 1
-and the prior of :mod:`casa_sara.solver.paperprior`; here are the bounds (Steps 7–10) and Algorithm 2.
+The task runs them with ``method='dabbech2018'``.  One iteration is that of :mod:`casa_sara.solver.adaptive_ppd` with
+ρ = 1 and the prior of :mod:`casa_sara.solver.paperprior`; here are the bounds (Steps 7–10) and Algorithm 2.
 """
 
 from __future__ import annotations
