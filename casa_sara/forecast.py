@@ -57,6 +57,7 @@ class Workload:
     share: float = 1.0
     masked: bool = False
     whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
+    duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
 
     @classmethod
     def of(cls, census, grid, options, report=False, band=0.0, channels=0, share=1.0, crew=ALONE):
@@ -65,7 +66,8 @@ class Workload:
         return cls(math.ceil(census.samples * crew.share), census.reach, grid.shape, grid.cell_rad,
                    len(crew.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
                    options.precondition, report and writes, grid.gridder, census.max_w, bool(grid.spectralindex), band,
-                   channels, share, grid.masked, (census.samples, bases) if writes and crew.comm.size > 1 else (0, 0))
+                   channels, share, grid.masked, (census.samples, bases) if writes and crew.comm.size > 1 else (0, 0),
+                   3 if options.method == "dabbech2018" else 2)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -101,7 +103,7 @@ class Workload:
             coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
             phases["iterating"] = solver | {
                 "image planes": self._planes(PLANE + SOLVING), "re-weighting": PASSING * self.samples,
-                "wavelet duals and weights": 2 * coefs, "wavelet workspace": workspace}
+                "wavelet duals and weights": self.duals * coefs, "wavelet workspace": workspace}
             if any(self.whole):
                 phases["writing a checkpoint"] = phases["iterating"] | {
                     "gathered of all ranks": 2 * (CHECKPOINT * self.whole[0]

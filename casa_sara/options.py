@@ -109,6 +109,7 @@ class Weighting:
 class SolverOptions:
     """Everything the solver may be told, named after the task parameters, which describe them."""
 
+    method: str = "tsara"
     niter: int = 100_000
     wavelets: tuple[str, ...] = SARA_BASES
     wavelevels: int = 4

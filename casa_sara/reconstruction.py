@@ -9,10 +9,12 @@ import numpy as np
 
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
+from casa_sara.papermethod import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
 from casa_sara.parallel import SERIAL
 from casa_sara.problem import Findings, Problem, Samples, first_image
 from casa_sara.sharing import ALONE, Layout
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
+from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve as solve_as_in_the_paper
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, solve
@@ -136,7 +138,8 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     schedule = schedule_of(options)
     if found.noise_only:
         schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
-    record = solve(ppd, bounds, schedule, progress, stopped, keep, solution.stage)
+    run = solve_as_in_the_paper if options.method == PAPER else solve
+    record = run(ppd, bounds, schedule, progress, stopped, keep, solution.stage)
     if record.stop_code == CONVERGED and found.noise_only:
         record.stop_code = NOISE_ONLY
     model = comm.own(ppd.model)
@@ -153,8 +156,8 @@ class _Solution:
 
     found: Findings
     ppd: AdaptivePPD
-    bounds: AdaptiveBounds | GivenBounds
-    stage: Stage | None = None
+    bounds: AdaptiveBounds | GivenBounds | PaperBounds
+    stage: Stage | PaperStage | None = None
 
     @classmethod
     def of(cls, problem, found, options, noise, crew):
@@ -162,8 +165,11 @@ class _Solution:
         measurement, unit_jy = problem.measurement, problem.unit_jy
         dictionary = SaraDictionary(measurement.shape, crew.wavelets(options.wavelets), options.wavelevels,
                                     nthreads=options.nthreads, n_bases=len(options.wavelets))
-        ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.samples.offsets, problem.precond,
-                          found.data_norm_sq, options.positivity, comm=crew.comm)
+        if options.method == PAPER:
+            ppd = paper_iteration(problem, dictionary, found.data_norm_sq, options.positivity)
+        else:
+            ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.samples.offsets, problem.precond,
+                              found.data_norm_sq, options.positivity, comm=crew.comm)
         ppd.unit_jy = unit_jy
         if problem.support is not None:
             ppd.confine(problem.support)
@@ -183,14 +189,21 @@ class _Solution:
 def _begin(samples, problem_of, options, noise, startmodel, stopped, crew):
     """Leave out wild samples, and begin from the first image or from `startmodel`."""
     problem, found, first = first_image(samples, problem_of, options, stopped, crew.comm)
+    paper = options.method == PAPER
+    if paper:
+        found.nnls_norms = block_norms(problem, problem_of, options, stopped)
     solution = _Solution.of(problem, found, options, noise, crew)
-    found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
+    threshold = first_threshold(options, first) if paper else None
+    if paper:
+        first = np.zeros_like(first)
+    else:
+        found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
     if startmodel is not None:
         first = startmodel / np.float32(problem.unit_jy)
         if problem.support is not None:
             first *= problem.support
     solution.ppd.start_from(first)
-    solution.ppd.rescale(STEP_BALANCE * _mean_brightness(first))
+    solution.ppd.rescale(threshold if paper else STEP_BALANCE * _mean_brightness(first))
     return solution
 
 
@@ -208,7 +221,7 @@ def _resume(samples, layout, problem_of, options, noise, checkpoint, crew):
         ppd |= {name: crew.scatter_bases(ppd[name]) for name in BASIS_ARRAYS}
         solution.ppd.set_state(ppd)
         solution.bounds.set_state(state["bounds"])
-        solution.stage = Stage.of(state["stage"])
+        solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
     return solution
 
 
@@ -238,12 +251,16 @@ def operator_accuracy(data, offsets, noise, comm=SERIAL):
 
 def schedule_of(options):
     """The solver's schedule for these task parameters."""
+    if options.method == PAPER:
+        return PaperSchedule.of(options)
     return Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,
                     options.reltol, options.finalreltol)
 
 
 def _bounds(ppd, nnls_norms, weights, noise, options):
     samples = ppd.block_sizes
+    if options.method == PAPER:
+        return paper_bounds(ppd, nnls_norms, weights, options)
     weight_sums = ppd.comm.block_sums(weights, ppd.offsets)
     common = dict(samples=samples, weight_sums=weight_sums, n_bases=ppd.dictionary.n_bases, regscale=options.regscale)
     if options.databound == "weights":

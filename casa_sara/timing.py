@@ -11,6 +11,7 @@ import numpy as np
 from casa_sara.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.sky import sky_operator
+from casa_sara.papermethod import PAPER, paper_prior
 from casa_sara.reconstruction import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.nnls import NNLS_ITERATIONS, nnls
@@ -49,6 +50,7 @@ class Timing:
     iterations: int
     reweightings: int
     channels: int = 1
+    nnls_iterations: int = NNLS_ITERATIONS
 
     @property
     def total(self) -> float:
@@ -56,7 +58,7 @@ class Timing:
         if not self.iterations:
             return STARTING + self.reading + self.channels * (self.building + self.writing)
         solving = (self.iterations + REWEIGHTING * self.reweightings) * self.iteration
-        first = NORM_PAIRS * self.pair + NNLS_ITERATIONS * self.nnls_iteration
+        first = NORM_PAIRS * self.pair + self.nnls_iterations * self.nnls_iteration
         return STARTING + self.reading + self.channels * (self.building + first + solving + self.writing)
 
 
@@ -91,11 +93,14 @@ def measure(data, offsets, grid, options, reading):
     pair = _seconds(lambda: measurement.adjoint(measurement.forward(image)))
     first = _seconds(lambda: nnls(measurement, vis, precond, bound, max_iter=2)) / 2.5  # and one Φ of the last image
     dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
+    if options.method == PAPER:
+        dictionary = paper_prior(dictionary, measurement)
     ppd = AdaptivePPD(measurement, dictionary, vis, offsets, precond, bound, options.positivity)
     ppd.threshold, ppd.l1_weights = 1.0, dictionary.allocate()
     schedule = schedule_of(options)
+    of_blocks = schedule.nnls_iterations if options.method == PAPER else 0
     return Timing(reading, building, pair, first, _seconds(ppd.step), writing, schedule.expected_iterations,
-                  schedule.expected_reweightings)
+                  schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks)
 
 
 def _seconds(call, repeats=3):

@@ -43,6 +43,7 @@ ROOMS = {
         "casa_sara.operators", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing", "casa_sara.solver",
         "casa_sara.visibilities", "numpy",
     },
+    "papermethod": {"casa_sara.operators", "casa_sara.problem", "casa_sara.solver", "numpy"},
     "resources": set(),
     "options": set(),
     "visibilities": {"numpy"},
@@ -63,7 +64,7 @@ ROOMS = {
     "jsonfile": set(),
 }
 LIBRARY = (
-    "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "noise", "cautions", "outliers", "problem", "operators", "solver",
+    "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "noise", "cautions", "outliers", "problem", "papermethod", "operators", "solver",
     "analysis",
 )
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}

@@ -18,6 +18,10 @@ WHY = {
     "data_norm_sq": "largest eigenvalue of the preconditioned normal operator, by Lanczos iterations",
     "regscale": "as given; 1 weighs the prior at the noise of one coefficient of the gradient of the data",
 }
+PAPER_WHY = {
+    "threshold_jy_per_pixel": "kappa: 1e-5 of the brightest pixel of the first image, and constant",
+    "regscale": "without meaning in this method",
+}
 
 
 def summary(result, options, full: bool = False) -> dict[str, Any]:
@@ -69,6 +73,7 @@ def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
             done = ends[-1] if ends else 0
     sara = {
         "version": casa_sara.__version__,
+        "method": options.method,
         "visibilities": result.data.size,
         "dropped": dict(result.data.dropped),
         "notes": list(result.data.notes),
@@ -132,6 +137,7 @@ def _sara(result, options, full):
     data = result.data
     sara = {
         "version": casa_sara.__version__,
+        "method": options.method,
         "visibilities": result.size,
         "dropped": dict(data.dropped),
         "notes": list(data.notes),
@@ -154,7 +160,7 @@ def _solution(result, options, full):
             "data_norm_sq": solved.data_norm_sq,
             "regscale": options.regscale,
         }
-        sara["why"] = dict(WHY)
+        sara["why"] = WHY | (PAPER_WHY if options.method == "dabbech2018" else {})
         sara["resumed"] = list(record.resumed)
         sara["wild"] = [dict(sample) for sample in solved.wild]
         sara["reweightings"] = [dict(update) for update in record.reweightings]

@@ -38,6 +38,7 @@ ARCSEC = math.pi / 180 / 3600
 
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
+    _check_method(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -45,6 +46,8 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     """Run the task on the ranks of a communicator, of which rank 0 alone writes; return the same on all."""
     log.info(f"casa_sara {casa_sara.__version__}")
     _check_stokes(parameters)
+    if parameters["method"] == "dabbech2018":
+        log.info("method = 'dabbech2018': Algorithms 1 and 2 of Dabbech et al. (2018), to the letter")
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
@@ -177,6 +180,18 @@ def _check_stokes(parameters):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = "
                              f"{right!r}")
+
+
+def _check_method(parameters):
+    """Raise on what the algorithm of the paper does not know."""
+    method = parameters["method"]
+    if method == "tsara":
+        return
+    for name, right, reason in (("regscale", 1.0, "it has no noise that could weigh its prior"),
+                                ("parallel", False, "it runs in one process")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, "
+                             "or method = 'tsara'")
 
 
 def _blocks(parameters):

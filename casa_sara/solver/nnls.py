@@ -15,7 +15,7 @@ PATH = 0.75  # of the iterations, over which the penalty falls
 
 
 def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last_penalty=1e-3, positivity=True,
-         stopped=lambda: False, support=None):
+         stopped=lambda: False, support=None, reltol=0.0):
     """Minimise ½‖U^½(y − Φx)‖² + t‖x‖₁ over x ≥ 0 while t falls to almost nothing.
 
     Non-negative least squares alone fills what the data do not see (the flux beyond the shortest baseline
@@ -39,9 +39,10 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last
         x ≥ 0; else only the penalty, by soft thresholds.
     stopped : callable
         Asked after every iteration from the 10th on; True ends the fit with what there is: the brightest sources.
-
     support : bool (nx, ny), optional
         x = 0 elsewhere.
+    reltol : float
+        Relative change of the image in one iteration that ends the fit earlier than `max_iter`; 0 for never.
 
     Returns
     -------
@@ -72,9 +73,10 @@ def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last
         # momentum that points uphill is dropped
         t = 1.0 if uphill.sum() > 0 else t
         t_next = 0.5 * (1 + np.sqrt(1 + 4 * t * t))
+        settled = reltol > 0 and np.linalg.norm(gradient - model) < reltol * np.linalg.norm(gradient)
         run(kernels.extrapolate, model, momentum, gradient, dtype.type((t - 1) / t_next))
         t = t_next
-        if stopped() and iteration + 1 >= FEWEST_ITERATIONS:
+        if settled or stopped() and iteration + 1 >= FEWEST_ITERATIONS:
             break
     measurement.forward(model, residual)
     np.subtract(vis, residual, out=residual)

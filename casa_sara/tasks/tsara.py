@@ -43,6 +43,7 @@ PARAMETERS = (
     Parameter('restoration', ('bool',), True, 'Do restoration steps (or not)'),
     Parameter('restoringbeam', ('string', 'stringVec'), [], 'Restoring beam shape to use. Default is the PSF main lobe', opener='restoration', open_on=(True,)),
     Parameter('pbcor', ('bool',), False, 'Apply PB correction on the output restored image', opener='restoration', open_on=(True,)),
+    Parameter('method', ('string',), 'tsara', "Algorithm: that of this task, or the paper's to the letter", allowed=('tsara', 'dabbech2018')),
     Parameter('niter', ('int',), 100000, 'Maximum number of iterations; 0 makes dirty images only', minimum=0.0),
     Parameter('wavelets', ('stringVec',), ['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], 'Bases in which the sky is sparse together', allowed=('dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8')),
     Parameter('wavelevels', ('int',), 4, 'Levels of the wavelet transforms', minimum=1.0),
@@ -369,6 +370,17 @@ class _tsara:
         .model divided by .pb: brightness on the sky, where all other images show what the antennas
         see of it. Below pblimit both are zero and masked.
 
+    method : {'tsara', 'dabbech2018'}, default 'tsara'
+        Both solve the same problem with the same operators, and make the same products:
+          'tsara'        what this task has made of the algorithm; nothing else needs to be set.
+          'dabbech2018'  Algorithms 1 and 2 as Dabbech et al. (2018) have them, for comparison: bounds that
+                         start from a non-negative least-squares fit of each block and are hard constraints,
+                         weights that fall with omega^k, 70 weighted problems. It takes many more iterations.
+        With 'dabbech2018' the parameters of the paper have the paper's values where they are left at their
+        defaults here: boundtol 1e-3, boundrelchange 1e-4, boundstep 0.618, boundinterval 100, nreweights 69,
+        reweightdecay 0.8, reweighttol 0 (never), reltol 1e-5, finalreltol 1e-6. regscale and parallel have no
+        meaning in it.
+
     niter : int, default 100000
         An upper limit, so large by default that the data decide when to stop. One iteration is one
         step of the primal-dual algorithm on the whole image and all data; a few hundred to a few
@@ -593,7 +605,7 @@ class _tsara:
         projection='SIN', startmodel='', specmode='mfs', reffreq='', spectralindex='', nchan=-1, start='', width='',
         outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest', perchanweightdensity=True,
         gridder='standard', wprojplanes=-1, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[],
-        restoration=True, restoringbeam=[], pbcor=False, niter=100000,
+        restoration=True, restoringbeam=[], pbcor=False, method='tsara', niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
         mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
         boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
