@@ -44,7 +44,7 @@ SMALL = {"7-m": 0.5}  # extended sources are this much smaller, so that the shor
 
 @dataclass(frozen=True)
 class Scene:
-    """A sky, the signal-to-noise ratio of its peak (0 for a blank one), who observes it, and the seed of all that is random."""
+    """A sky, the S/N of its peak (0 for a blank one), who observes it, and the seed of all that is random."""
 
     group: str
     sky: str
@@ -127,7 +127,8 @@ def gaussian(x, y, place, fwhm, ratio=1.0, angle=0.0):
     """A Gaussian of unit integral at `place`; `ratio` is that of its axes."""
     cos, sin = np.cos(angle), np.sin(angle)
     along, across = (x - place[0]) * cos + (y - place[1]) * sin, (y - place[1]) * cos - (x - place[0]) * sin
-    return FWHM**2 / (2 * np.pi * fwhm**2 * ratio) * np.exp(-0.5 * FWHM**2 * (along**2 + (across / ratio) ** 2) / fwhm**2)
+    sigma = fwhm / FWHM
+    return np.exp(-0.5 * (along**2 + (across / ratio) ** 2) / sigma**2) / (2 * np.pi * sigma**2 * ratio)
 
 
 def off_pixels(rng, n, number, part=0.7):
@@ -211,9 +212,9 @@ def laid_out(scene: Scene, folder: Path, rng):
     vla = file.startswith("vla")
     observation = Observation(
         telescope="VLA" if vla else "ALMA", antenna_file=f"alma/simmos/{file}.cfg", source="target",
-        direction=("16h00m00.0s", f"{sign}{degrees}d{minutes:02d}m00.0s"), freq_hz=freq, channel_hz=100e6, channels=channels,
-        correlations="RR LL" if vla else "XX YY", hour_angles=hours, scans=scans, integrations=integrations,
-        integration_s=seconds,
+        direction=("16h00m00.0s", f"{sign}{degrees}d{minutes:02d}m00.0s"), freq_hz=freq, channel_hz=100e6,
+        channels=channels, correlations="RR LL" if vla else "XX YY", hour_angles=hours, scans=scans,
+        integrations=integrations, integration_s=seconds,
     )  # fmt: skip
     simulate_observation(folder, Sky(np.zeros((4, 4)), 1e-6), ("obs",), np.inf, observation=observation)
     tb = table()
