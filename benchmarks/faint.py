@@ -6,7 +6,7 @@
     python benchmarks/faint.py FOLDER --only clean        # run tclean on what is not done yet
     python benchmarks/faint.py FOLDER --only tsara        # run tsara, anew
     python benchmarks/faint.py FOLDER --only table        # the table and its summary
-    python benchmarks/faint.py FOLDER --scenes points_30  # only scenes whose label holds this
+    python benchmarks/faint.py FOLDER --scenes points_30_  # only scenes whose label holds this
     python benchmarks/faint.py FOLDER --options regscale=2.0 nreweights=5   # kept under another name than the defaults
     python benchmarks/faint.py FOLDER --only table --twice     # tsara on images of twice the width: does the flux stay?
     python benchmarks/faint.py FOLDER --only table --picture   # a picture of all models as well, FOLDER/<set>.png
