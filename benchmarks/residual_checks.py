@@ -55,7 +55,7 @@ class Observed:
         return MeasurementOperator(self.data.uvw[:2], cell_rad, shape, dtype=np.float64, eps=1e-8)
 
     def left(self, model, cell_arcsec=None, centre=None):
-        """Return the data minus a model's visibilities, Jy; another cell or centre (pixel) than the image's if given."""
+        """Return data minus a model's visibilities, Jy; `cell_arcsec` and `centre` (pixel) where not the image's."""
         operator, cell_rad = self._operator, np.radians((cell_arcsec or self.cell_arcsec) / 3600)
         if cell_arcsec is not None or model.shape != operator.shape:
             operator = self._sees(model.shape, cell_rad)
