@@ -202,7 +202,7 @@ def picture(path, name, runs):
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(len(runs), 3, figsize=(13, 4 * len(runs)), constrained_layout=True, squeeze=False)
-    spread = 5 * np.median([images["residual"].std() for images in runs.values()])
+    spread = 8 * min(images["residual"].std() for images in runs.values())
     first = next(iter(runs.values()))
     for row, (imager, images) in zip(axes, runs.items()):
         for axis, kind in zip(row, ("model", "image", "residual")):
