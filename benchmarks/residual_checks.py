@@ -28,7 +28,7 @@ __all__ = ["BEAMS", "Observed"]
 
 BINS = 8  # of baseline length, of as many samples each
 BEAMS = (1, 2, 4, 8)  # to which the residual image is smoothed
-REALISATIONS = 4  # of the noise
+REALISATIONS = 16  # of the noise
 
 
 class Observed:
