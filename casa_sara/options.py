@@ -127,6 +127,7 @@ class SolverOptions:
     reltol: float = 3e-4
     finalreltol: float = 3e-4
     regscale: float = 1.0
+    significance: float = 5.0
     nthreads: int = 1
 
 

@@ -254,7 +254,7 @@ def schedule_of(options):
     if options.method == PAPER:
         return PaperSchedule.of(options)
     return Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,
-                    options.reltol, options.finalreltol)
+                    options.reltol, options.finalreltol, significance=options.significance)
 
 
 def _bounds(ppd, nnls_norms, weights, noise, options):

@@ -95,7 +95,8 @@ class AdaptivePPD:
                  relaxation=RELAXATION, comm=SERIAL):
         self.measurement, self.dictionary, self.comm = measurement, dictionary, comm
         self.vis, self.precond, self.offsets = vis, precond, np.asarray(offsets)
-        self.relaxation = relaxation
+        self.relaxation, self.positivity = relaxation, positivity
+        self._confined_to = None
         self.tau, self.l2_step = 0.495, 1.0 / data_norm_sq
         dtype = vis.real.dtype
         self.model, self.anchor, self.model_bar, self.lowest = comm.images(4, measurement.shape, dtype)
@@ -139,6 +140,16 @@ class AdaptivePPD:
 
     def confine(self, support):
         """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}."""
+        self._confined_to = support
+        self.lowest[~support] = np.inf
+        self.comm.settle()
+
+    def support_only(self, support):
+        """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again."""
+        if self._confined_to is not None:
+            support = support & self._confined_to
+        self.comm.settle()  # all ranks of one machine have read
+        self.lowest[support & (self.lowest == np.inf)] = 0 if self.positivity else -np.inf
         self.lowest[~support] = np.inf
         self.comm.settle()
 

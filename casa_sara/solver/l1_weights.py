@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 
 __all__ = ["band_noise", "first_weights", "reweight"]
 
 SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at the end
 SLAB = 64  # lines squared at a time
 DRAWN = 1 << 20  # random numbers at a time
+APPROXIMATIONS = 0.12  # of the prior on them within a support: they hold the flux, and little of the noise
+POINTS = 0.25  # of the prior, on sources that one point explains
 
 
 def band_noise(ppd, bounds, seed=20180404):
@@ -61,8 +64,8 @@ def _rms(values):
     return float(np.sqrt(sum(np.square(slab, dtype=float).sum() for slab in slabs) / values.size))
 
 
-def first_weights(ppd, bounds):
-    """W = ν: the noise of every band in units of a pixel's, but at least 1.
+def first_weights(ppd, bounds, confined=False):
+    """W = ν: the noise of every band in units of a pixel's, but at least 1; those of the approximations less if `confined`.
 
     Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
     threshold at the noise of one pixel would let it through.
@@ -70,7 +73,7 @@ def first_weights(ppd, bounds):
     if ppd.l1_weights is None:
         ppd.l1_weights = ppd.dictionary.allocate()
     noise, pixel = band_noise(ppd, bounds)
-    for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel)):
+    for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel) * _shares(ppd, confined)):
         ppd.l1_weights[band.slice] = scale
 
 
@@ -79,9 +82,45 @@ def _band_scales(noise, pixel):
     return np.maximum(noise / pixel, 1.0)
 
 
-def reweight(ppd, bounds, scale):
-    """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less."""
+def _shares(ppd, confined):
+    """Share of the prior that each band has."""
+    return np.array([APPROXIMATIONS if confined and band.level and band.orientation == "aa" else 1.0
+                     for band in ppd.dictionary.bands()])
+
+
+def reweight(ppd, bounds, scale, confined=False, points=None):
+    """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less.
+
+    Within a support of what is significant (`confined`) the coarse bands cannot fill with noise any more, and the prior
+    may let go of them sooner: there α is scale × the noise of a coefficient of the model, that of a pixel over ν.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+    scale : float
+    confined : bool
+    points : bool (nx, ny), optional
+        Pixels of sources that one point explains: W is a quarter around them.
+    """
     noise, pixel = band_noise(ppd, bounds)
-    ppd.dictionary.reweight(ppd.model, scale * np.minimum(noise, pixel), _band_scales(noise, pixel), ppd.l1_weights)
+    scales = _band_scales(noise, pixel)
+    alpha = scale * np.minimum(noise, pixel) / (scales if confined else 1.0)
+    ppd.dictionary.reweight(ppd.model, alpha, scales * _shares(ppd, confined), ppd.l1_weights)
+    if points is not None and points.any():
+        _weaken(ppd, points)
     ppd.rescale(SHRINK * ppd.threshold)
     bounds.apply_to(ppd)
+
+
+def _weaken(ppd, points):
+    """Multiply W by POINTS in the coefficients of every band that lie at the points, or beside them."""
+    plane = np.zeros(ppd.dictionary.coef_shape[1:], bool)
+    plane[:points.shape[0], :points.shape[1]] = points
+    at, nx, ny = {0: points}, *plane.shape
+    for level in range(1, ppd.dictionary.levels + 1):
+        blocks = plane.reshape(nx >> level, 1 << level, ny >> level, 1 << level).any(axis=(1, 3))
+        at[level] = maximum_filter(blocks, 3)
+    for band in ppd.dictionary.bands():
+        weights = ppd.l1_weights[band.slice]
+        weights[at[band.level]] *= weights.dtype.type(POINTS)

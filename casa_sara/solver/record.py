@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 __all__ = ["CONVERGED", "DIVERGED", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER", "STOP_DESCRIPTIONS",
-           "SolverRecord", "TIME_LIMIT", "UNFEASIBLE", "UNFINISHED"]
+           "STRUCTURED", "SolverRecord", "TIME_LIMIT", "UNFEASIBLE", "UNFINISHED"]
 
 CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, DIVERGED, UNFEASIBLE = 101, 102, 103, 104, 105, 106
-TIME_LIMIT = 107
+TIME_LIMIT, STRUCTURED = 107, 108
 STOP_DESCRIPTIONS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "iteration limit",
@@ -19,6 +19,7 @@ STOP_DESCRIPTIONS = {
     DIVERGED: "diverged",
     UNFEASIBLE: "converged, but the data do not fit the bounds",
     TIME_LIMIT: "time limit",
+    STRUCTURED: "converged, but the residual is not noise",
 }
 UNFINISHED = (STOPPED_BY_USER, TIME_LIMIT)  # which a restart takes up again
 
@@ -41,8 +42,12 @@ class SolverRecord:
     bounds : list of (int, float (d,))
         Iteration and ε_j, at the start and whenever they moved.
     reweightings : list of dict
-        Iteration, scale of the weights, relative change of the model since the one before, and pixels that were then
-        allowed to be negative.
+        Iteration, scale of the weights, relative change of the model since the one before, pixels that were then
+        allowed to be negative, and pixels of the support.
+    islands : list of dict
+        Of the model, see :func:`casa_sara.solver.islands.islands_of`.
+    residual_snr : list of dict
+        Largest S/N of the residual, `snr`, smoothed to `beams`.
     resumed : list of int
         The iterations of the checkpoints from which the solution was resumed.
     stop_code : int
@@ -57,6 +62,8 @@ class SolverRecord:
     model_max: list[float] = field(default_factory=list)
     bounds: list[tuple[int, np.ndarray]] = field(default_factory=list)
     reweightings: list[dict] = field(default_factory=list)
+    islands: list[dict] = field(default_factory=list)
+    residual_snr: list[dict] = field(default_factory=list)
     resumed: list[int] = field(default_factory=list)
     stop_code: int = 0
 

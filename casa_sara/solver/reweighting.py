@@ -6,9 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from casa_sara.solver.islands import look_at
 from casa_sara.solver.l1_weights import first_weights, reweight
 from casa_sara.solver.positivity import Release
-from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE, SolverRecord
+from casa_sara.solver.record import (CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, STRUCTURED, UNFEASIBLE,
+                                     SolverRecord)
+from casa_sara.solver.significance import SignificantSupport
 
 __all__ = ["Schedule", "Stage", "solve"]
 
@@ -41,6 +44,9 @@ class Schedule:
         Relative change that ends one ℓ1 problem, and the last one.
     interval : int
         Most iterations of one ℓ1 problem before the last.
+    significance : float
+        Standard deviations that emission needs to be in the model; 0 for a model that nothing confines. It is looked
+        for at every re-weighting, so there is no support without one.
     """
 
     niter: int = 100_000
@@ -50,6 +56,12 @@ class Schedule:
     reltol: float = 3e-4
     final_reltol: float = 3e-4
     interval: int = 30
+    significance: float = 0.0
+
+    @property
+    def confined(self) -> bool:
+        """Whether the model is confined to what is significant."""
+        return self.significance > 0 and self.nreweights > 0
 
     @property
     def expected_iterations(self) -> int:
@@ -77,6 +89,7 @@ class Stage:
     settled : int
         For how many iterations the model has changed by less than the tolerance.
     release : Release
+    support : SignificantSupport or None
     record : SolverRecord
     """
 
@@ -85,6 +98,7 @@ class Stage:
     start: int = 0
     settled: int = 0
     release: Release = field(default_factory=Release)
+    support: SignificantSupport | None = None
     record: SolverRecord = field(default_factory=SolverRecord)
 
     @property
@@ -94,13 +108,15 @@ class Stage:
 
     def state(self):
         """Return all of it: plain values, and the arrays themselves."""
-        return vars(self) | dict(release=self.release.state(), record=self.record.state())
+        return vars(self) | dict(release=self.release.state(), record=self.record.state(),
+                                 support=self.support and self.support.state())
 
     @classmethod
     def of(cls, state):
         """Make it of what :meth:`state` has returned."""
         stage = cls(np.array(state["previous"]), state["last"], state["start"], state["settled"])
         stage.release.set_state(state["release"])
+        stage.support = state["support"] and SignificantSupport(**state["support"])
         stage.record.set_state(state["record"])
         return stage
 
@@ -134,7 +150,7 @@ def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, s
     -------
     SolverRecord
     """
-    stage = _begin(ppd, bounds) if stage is None else stage
+    stage = _begin(ppd, bounds, schedule) if stage is None else stage
     record = stage.record
     while True:
         if stage.k >= schedule.nreweights and not stage.last:
@@ -148,14 +164,16 @@ def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, s
             _begin_last(ppd, bounds, stage)
     if record.stop_code == DIVERGED:
         ppd.model[...] = stage.previous
+    elif schedule.confined and look_at(ppd, bounds, record) and record.stop_code == CONVERGED:
+        record.stop_code = STRUCTURED
     return record
 
 
-def _begin(ppd, bounds):
+def _begin(ppd, bounds, schedule):
     """The first problem."""
     bounds.apply_to(ppd)
-    first_weights(ppd, bounds)
-    stage = Stage(ppd.model.copy())
+    first_weights(ppd, bounds, schedule.confined)
+    stage = Stage(ppd.model.copy(), support=SignificantSupport(schedule.significance) if schedule.confined else None)
     stage.record.bounds.append((0, bounds.l2_bounds.copy()))
     return stage
 
@@ -206,9 +224,11 @@ def _renew_weights(ppd, bounds, schedule, stage):
     if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, change):
         return False
     stage.previous[...] = ppd.model
-    reweight(ppd, bounds, max(scale, LAST_SCALE))
+    support = stage.support
+    pixels = support.update(ppd, bounds) if support else ppd.model.size
+    reweight(ppd, bounds, max(scale, LAST_SCALE), support is not None, support and support.points)
     stage.record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
-                                          released=released))
+                                          released=released, support=pixels))
     return True
 
 

@@ -1,0 +1,89 @@
+"""What the model consists of, island by island, and what it has left in the residual."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import find_objects, label
+from scipy.signal import fftconvolve
+
+from casa_sara.solver.matched_filter import BEAMS, SIGMA_TO_FWHM
+from casa_sara.solver.significance import gradient_image, matched_filter
+
+__all__ = ["STRUCTURE", "islands_of", "look_at"]
+
+STRUCTURE = 5.0  # standard deviations over a beam or more, from which on a residual is not noise
+
+
+def look_at(ppd, bounds, record):
+    """Note in the record the islands of the model and the peaks of the residual, where a support confines the model.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+    record : SolverRecord
+        `islands` and `residual_snr` are set.
+
+    Returns
+    -------
+    bool
+        Whether the residual holds structure of more than 5 standard deviations over more than a beam.
+    """
+    filter_ = matched_filter(ppd, bounds)
+    gradient = gradient_image(ppd, bounds, ppd.model)
+    record.residual_snr = ppd.comm.once(_peaks, filter_, gradient)
+    record.islands = ppd.comm.once(islands_of, ppd.model, filter_.psf, ppd.unit_jy)
+    return any(entry["snr"] > STRUCTURE for entry in record.residual_snr if entry["beams"] >= 1)
+
+
+def _peaks(filter_, gradient):
+    """Largest |S/N| of the residual at every width."""
+    spectrum = filter_.spectrum(gradient)
+    return [dict(beams=beams, snr=float(np.abs(filter_.snr(spectrum, scale)).max()))
+            for scale, beams in enumerate(BEAMS[:len(filter_.widths)])]
+
+
+def islands_of(model, psf, unit_jy=1.0):
+    """List the connected regions of a model, the most significant first.
+
+    Parameters
+    ----------
+    model : real (nx, ny)
+        x.
+    psf : real (nx, ny)
+        Φ†Σ⁻¹Φ of a pixel of 1 at (nx // 2, ny // 2).
+    unit_jy : float
+        Jy in the unit of the model.
+
+    Returns
+    -------
+    list of dict
+        `x`, `y` (pixel of the centroid), `flux_jy`, `flux_error_jy`, `snr` (‖Σ^{−½}Φx_i‖, the square root of the χ² that the
+        island explains; the error of the flux is that of its strength, its shape being known), `pixels` (area) and
+        `fwhm_pixels` (of a circular Gaussian of the same second moments).
+    """
+    labels, number = label(model != 0, np.ones((3, 3), int))
+    found = []
+    for index, box in zip(range(1, number + 1), find_objects(labels)):
+        part = np.where(labels[box] == index, model[box], 0).astype(float)
+        size = np.abs(part)
+        total = size.sum()
+        x, y = (np.arange(s.start, s.stop) for s in box)
+        centre = [float(size.sum(axis=1) @ x / total), float(size.sum(axis=0) @ y / total)]
+        spread = size.sum(axis=1) @ (x - centre[0]) ** 2 + size.sum(axis=0) @ (y - centre[1]) ** 2
+        snr = float(np.sqrt(max(np.vdot(part, _response(part, psf)), 0.0)))
+        flux = float(part.sum() * unit_jy)
+        found.append(dict(x=centre[0], y=centre[1], flux_jy=flux, flux_error_jy=abs(flux) / max(snr, 1e-30), snr=snr,
+                          pixels=int(np.count_nonzero(part)),
+                          fwhm_pixels=float(SIGMA_TO_FWHM * np.sqrt(0.5 * spread / total))))
+    return sorted(found, key=lambda island: -island["snr"])
+
+
+def _response(part, psf):
+    """Φ†Σ⁻¹Φ of a part of the image, in that part."""
+    nx, ny = part.shape
+    cx, cy = (n // 2 for n in psf.shape)
+    kernel = np.zeros((2 * nx - 1, 2 * ny - 1))
+    left, low, right, high = min(cx, nx - 1), min(cy, ny - 1), min(psf.shape[0] - cx, nx), min(psf.shape[1] - cy, ny)
+    kernel[nx - 1 - left:nx - 1 + right, ny - 1 - low:ny - 1 + high] = psf[cx - left:cx + right, cy - low:cy + high]
+    return fftconvolve(kernel, part, mode="valid") if part.size > 1 else kernel * part

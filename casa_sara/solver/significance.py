@@ -1,0 +1,151 @@
+"""Where the model may be other than zero: where the data show emission at the significance asked for.
+
+Noise is fitted by positive pixels as a carpet of islands of one or two standard deviations, and no penalty that leaves
+faint sources alone removes it.  The model is therefore confined to a support, found anew at every re-weighting: pixels
+around what a matched filter of some width (a point, one, two, four or eight beams) finds at the significance asked
+for.  Within it the prior needs to hold less (:mod:`casa_sara.solver.l1_weights`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import label, maximum_filter, minimum_filter
+
+from casa_sara.solver.matched_filter import MatchedFilter
+from casa_sara.solver.unresolved import unresolved
+
+__all__ = ["SignificantSupport", "gradient_image", "matched_filter"]
+
+GROWN = 0.5  # of the significance, down to which the surroundings belong to a source
+SURE = 10.0  # times the significance: what is believed of a model that nothing confines yet
+FAINT, CORE, RIM = 0.3, 0.5, 0.5  # of the significance, beside emission that is wider than the core, out to the rim, in widths
+EXCESS = 1.25  # residual over the noise level found, from which on the noise of the image is measured in the residual
+MEDIAN_TO_SIGMA = 1.482602218505602
+
+
+class SignificantSupport:
+    """The support of the model and the point sources in it.
+
+    The first support holds what is sure of the first model, later ones what is significant in the residual and in the
+    model that the support before allowed.  A level never lies below the sidelobes of what is still left.  Templates
+    go from narrow to wide, and what the narrow ones have found counts as known for the wide ones.  Where the residual
+    image is noisier than the visibilities say (calibration errors), the significance is in units of its own noise.
+
+    Parameters
+    ----------
+    significance : float
+        Standard deviations asked for, > 0.
+    begun : bool
+        Whether there is a support already.
+
+    Attributes
+    ----------
+    points : bool (nx, ny) or None
+        Pixels of sources that one point explains, see :mod:`casa_sara.solver.unresolved`.
+    """
+
+    def __init__(self, significance, begun=False):
+        self.significance, self.begun = float(significance), bool(begun)
+        self.points = None
+
+    def update(self, ppd, bounds):
+        """Confine the model to what is significant now.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            Its support is changed.
+        bounds : GivenBounds or AdaptiveBounds
+            Whose noise levels are the noise.
+
+        Returns
+        -------
+        int
+            Pixels of the support.
+        """
+        gradient = gradient_image(ppd, bounds, ppd.model)
+        psf = point_response(ppd, bounds)
+        support, self.points = ppd.comm.once(self._found, gradient, psf, ppd.model, ppd.positivity,
+                                             ppd.measurement.workers.count)
+        self.begun = True
+        ppd.support_only(support)
+        return int(np.count_nonzero(support))
+
+    def _found(self, gradient, psf, model, positivity, workers):
+        """Return the support and the points in it."""
+        filter_ = MatchedFilter(psf, workers)
+        signed = (lambda snr: snr) if positivity else np.abs
+        spectrum = filter_.spectrum(gradient)
+        if not self.begun:
+            snr = signed(filter_.snr(spectrum, 0, model))
+            level = np.clip(filter_.sidelobe * snr.max(), self.significance, SURE * self.significance)
+            support = _connected(snr, level)
+        else:
+            support = self._grown(filter_, spectrum, model, signed)
+        if not positivity or not support.any():
+            return support, np.zeros(support.shape, bool)
+        return unresolved(filter_, gradient, model, support, self.significance)
+
+    def _grown(self, filter_, spectrum, model, signed):
+        """The support of a model that a support has confined already."""
+        found = np.zeros(model.shape, bool)
+        rim, empty = found.copy(), model == 0
+        significance = self.significance * _excess(filter_.snr(spectrum, 0), empty)
+        for scale, width in enumerate(filter_.widths):
+            left = signed(filter_.snr(spectrum, scale))
+            level = max(significance, filter_.sidelobe * float(left.max(initial=0, where=empty)))
+            snr = signed(filter_.snr(spectrum, scale, np.where(found, 0, model)))
+            found |= _connected(snr, level)
+            if scale and level == significance:
+                core = minimum_filter(found, 2 * int(CORE * width) + 1)
+                rim |= maximum_filter(core, 2 * int((CORE + RIM) * width) + 1) & (snr >= FAINT * significance)
+        return found | rim
+
+    def state(self):
+        """Return what the next call depends on, beside the state of the iteration."""
+        return dict(significance=self.significance, begun=self.begun)
+
+
+def matched_filter(ppd, bounds):
+    """Return the :class:`MatchedFilter` of the data with the present noise levels."""
+    return MatchedFilter(point_response(ppd, bounds), ppd.measurement.workers.count)
+
+
+def point_response(ppd, bounds):
+    """Return Φ†Σ⁻¹Φ of a pixel of 1 in the middle of the image, real (nx, ny)."""
+    vis, image = ppd.scratch_vis, ppd.scratch_image
+    image.fill(0)
+    image[tuple(n // 2 for n in image.shape)] = 1
+    ppd.measurement.forward(image, vis)
+    vis *= _whitening(ppd, bounds)
+    return ppd.adjoint(vis, image).copy()
+
+
+def gradient_image(ppd, bounds, model):
+    """Return Φ†Σ⁻¹(y − Φx), real (nx, ny)."""
+    vis = ppd.scratch_vis
+    ppd.measurement.forward(model, vis)
+    np.subtract(ppd.vis, vis, out=vis)
+    vis *= _whitening(ppd, bounds)
+    return ppd.adjoint(vis, ppd.scratch_image).copy()
+
+
+def _whitening(ppd, bounds):
+    """1/σ² of every sample."""
+    return np.repeat(bounds.noise_weights.astype(ppd.precond.dtype), np.diff(ppd.offsets))
+
+
+def _connected(snr, level):
+    """Regions above GROWN × level that hold a pixel above the level."""
+    labels, number = label(snr >= GROWN * level)
+    chosen = np.zeros(number + 1, bool)
+    chosen[labels[snr >= level]] = True
+    chosen[0] = False
+    return chosen[labels]
+
+
+def _excess(snr, empty):
+    """Noise of the residual image where the model is empty, in units of what it should be; 1 where it is not much more."""
+    values = snr[empty] if 5 * np.count_nonzero(empty) > snr.size else snr
+    noise = MEDIAN_TO_SIGMA * float(np.median(np.abs(values)))
+    return noise if noise > EXCESS else 1.0

@@ -1,0 +1,120 @@
+"""Sources that one point explains: what the data cannot tell from a point is modelled as one.
+
+The prior prefers smooth sources, and where a source is faint the data do not contradict it: an unresolved source comes
+out as wide as the beam, and too faint where it is.  Of a source that leaves nothing significant when one point is taken
+out of the data, the simplest model is that point.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import maximum_filter, shift
+from scipy.signal import fftconvolve
+
+from casa_sara.solver.matched_filter import SIGMA_TO_FWHM
+
+__all__ = ["unresolved"]
+
+REACH = 1.75  # beams around a point in which there must be nothing else
+NARROW, FEWEST_PIXELS = 0.35, 1.0  # beams around a point, and pixels, in which the model may hold it
+FITS = 3.5  # standard deviations that may be left
+TEMPLATES, TEMPLATE_REACH = 3, 2.5  # widths at which what is left is looked at; their reach in beams
+ALL_BUT = 1.5  # times as much flux as the point has, at most, and five standard deviations
+
+
+def unresolved(filter_, gradient, model, support, significance):
+    """Narrow a support around the sources that one point explains.
+
+    Parameters
+    ----------
+    filter_ : MatchedFilter
+    gradient : real (nx, ny)
+        Φ†Σ⁻¹(y − Φx).
+    model : real (nx, ny)
+        x.
+    support : bool (nx, ny)
+    significance : float
+        Least S/N of a point.
+
+    Returns
+    -------
+    support : bool (nx, ny)
+        Without what is around the points.
+    points : bool (nx, ny)
+        The pixels left to the points, a part of the support.
+    """
+    snr = filter_.snr(filter_.spectrum(gradient), 0, model)
+    peaks = np.argwhere((snr == maximum_filter(snr, int(filter_.beam) | 1)) & (snr >= significance) & support)
+    patch = _Patch(filter_)
+    margin = patch.outer
+    gradient, model, support = (np.pad(image, margin) for image in (gradient, model, support))
+    given_up, points = np.zeros_like(support), np.zeros_like(support)
+    for peak in peaks + margin:
+        place = patch.point_at(gradient, model, peak)
+        if place is not None:
+            given_up[patch.around(peak)] |= patch.disc
+            points[patch.around(place)] |= patch.narrow
+    inside = tuple(slice(margin, n - margin) for n in support.shape)
+    return ((support & ~given_up) | points)[inside], points[inside]
+
+
+class _Patch:
+    """The surroundings of one source: `disc` and `narrow` are bool (2r + 1, 2r + 1)."""
+
+    def __init__(self, filter_):
+        self.reach, self.outer = self._sizes(filter_.beam)
+        radius = _radius(self.reach)
+        self.disc, self.narrow = radius <= REACH * filter_.beam, radius <= max(FEWEST_PIXELS, NARROW * filter_.beam)
+        self._looked_at = _radius(self.outer) <= REACH * filter_.beam
+        half = self.reach + self.outer
+        centre = [n // 2 + half for n in filter_.shape]
+        padded = np.pad(filter_.psf, half)
+        self._psf = padded[tuple(slice(c - half, c + half + 1) for c in centre)]
+        self._noise = float(self._psf[half, half]) ** -0.5
+        self._templates = [_template(self.outer, filter_.widths[k]) / filter_.norm(k)
+                           for k in range(min(TEMPLATES, len(filter_.widths)))]
+
+    @staticmethod
+    def _sizes(beam):
+        reach = int(np.ceil(REACH * beam)) + 1
+        return reach, reach + int(np.ceil(TEMPLATE_REACH * beam))
+
+    def around(self, pixel):
+        """Slices of the patch around a pixel."""
+        return tuple(slice(k - self.reach, k + self.reach + 1) for k in pixel)
+
+    def point_at(self, gradient, model, peak):
+        """The pixel of the one point that explains what is around a peak; None where none does."""
+        near = model[self.around(peak)] * self.disc
+        wide = tuple(slice(k - self.outer, k + self.outer + 1) for k in peak)
+        # the gradient of the data without the other sources
+        alone = gradient[wide] + fftconvolve(self._psf, near, mode="valid")
+        o = self.outer
+        flux = alone[o, o] * self._noise**2
+        if near.sum() > ALL_BUT * flux + 5 * self._noise:
+            return None
+        offset = [_vertex(alone[o - 1:o + 2, o]), _vertex(alone[o, o - 1:o + 2])]
+        psf = self._psf[self.reach - 3:-(self.reach - 3), self.reach - 3:-(self.reach - 3)]
+        psf = shift(psf, offset, order=3)[3:-3, 3:-3]
+        alone -= (alone[o, o] / psf[o, o]) * psf
+        for template in self._templates:
+            if np.abs(fftconvolve(alone, template, mode="same")[self._looked_at]).max() >= FITS:
+                return None
+        return [int(np.rint(k + by)) for k, by in zip(peak, offset)]
+
+
+def _vertex(three):
+    """Where the parabola through three values has its maximum, −1 … 1 from the middle."""
+    curvature = three[0] - 2 * three[1] + three[2]
+    return float(np.clip(0.5 * (three[0] - three[2]) / curvature, -1, 1)) if curvature < 0 else 0.0
+
+
+def _radius(half):
+    return np.hypot(*np.ogrid[-half:half + 1, -half:half + 1])
+
+
+def _template(half, width):
+    """A Gaussian of unit sum; a pixel of 1 where the width is 0."""
+    radius = _radius(half)
+    values = np.exp(-0.5 * (radius * SIGMA_TO_FWHM / width) ** 2) if width else (radius == 0).astype(float)
+    return values / values.sum()
