@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from casa_sara.casa import log
+from casa_sara.casa.catalogue import list_islands
 from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import ImagePlane, define_image_plane
 from casa_sara.casa.images import read_model
@@ -210,7 +211,8 @@ class _Cube:
 
     def take(self, k, reconstruction):
         """Make the images of a channel from its solution."""
-        part = self._split(k)
+        part, request = self._split(k), self.request
+        list_islands(reconstruction.record, self.plane, request.grid.cell_rad, request.options.significance)
         data, blocks = without_wild(part.data, part.blocks, part.offsets, reconstruction)
         self._fill(k, data, blocks, part.noise, reconstruction, reconstruction.model)
 

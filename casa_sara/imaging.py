@@ -10,6 +10,7 @@ import numpy as np
 
 from casa_sara.casa import log
 from casa_sara.casa.blockwords import divide
+from casa_sara.casa.catalogue import list_islands
 from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
@@ -159,6 +160,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
                                          crew)
             forecast = replace(forecast, iteration_s=watch.pace.seconds)
             model = reconstruction.model
+            list_islands(reconstruction.record, plane, grid.cell_rad, options.significance, comm)
             data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
             offsets = np.searchsorted(reconstruction.kept, offsets)
         # write

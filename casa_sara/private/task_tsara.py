@@ -188,6 +188,7 @@ def _check_method(parameters):
     if method == "tsara":
         return
     for name, right, reason in (("regscale", 1.0, "it has no noise that could weigh its prior"),
+                                ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
                                 ("parallel", False, "it runs in one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, "

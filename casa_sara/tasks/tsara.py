@@ -64,6 +64,7 @@ PARAMETERS = (
     Parameter('reltol', ('double',), 0.0003, 'Relative change of the model in one iteration that counts as converged', minimum=0.0, maximum=1.0),
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
+    Parameter('significance', ('double',), 5.0, 'Signal-to-noise ratio of emission that enters the model; 0 for no limit', minimum=0.0),
     Parameter('blocks', ('int', 'string', 'stringVec'), 0, 'Data blocks, each with its own bound: 0, one per snapshot; a number; or which data to set apart'),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0, maximum=1024.0),
     Parameter('dryrun', ('bool',), False, 'Only say what the run would take: memory and time'),
@@ -378,8 +379,8 @@ class _tsara:
                          weights that fall with omega^k, 70 weighted problems. It takes many more iterations.
         With 'dabbech2018' the parameters of the paper have the paper's values where they are left at their
         defaults here: boundtol 1e-3, boundrelchange 1e-4, boundstep 0.618, boundinterval 100, nreweights 69,
-        reweightdecay 0.8, reweighttol 0 (never), reltol 1e-5, finalreltol 1e-6. regscale and parallel have no
-        meaning in it.
+        reweightdecay 0.8, reweighttol 0 (never), reltol 1e-5, finalreltol 1e-6. regscale, significance and
+        parallel have no meaning in it.
 
     niter : int, default 100000
         An upper limit, so large by default that the data decide when to stop. One iteration is one
@@ -487,9 +488,18 @@ class _tsara:
 
     regscale : float, default 1.0
         The weight of the sparsity prior against the data: 1 is the noise of one coefficient of the
-        gradient of the data, from the noise levels found and the weights (where calibration errors
-        prevail, up to 1.4 times that). Larger values give a smoother image and an emptier background,
-        e.g. 2 for faint emission in a wide field; smaller ones follow the noise.
+        gradient of the data, from the noise levels found and the weights. Larger values give a smoother
+        image; smaller ones follow the noise.
+
+    significance : float, default 5.0
+        The model is zero where the data show no emission of this many standard deviations, at the
+        resolution of the natural beam or smoothed to 1, 2, 4 or 8 beams, so that extended emission
+        counts with its sum. Where a source is found, its surroundings belong to it down to half of that.
+        A source that one point explains is modelled as one. Where the residual image is noisier than
+        the visibilities (calibration errors), the standard deviation is that of the residual image.
+        The islands of emission are listed in the log and in the record, with flux, error and
+        signal-to-noise ratio. It is looked for at every re-weighting (nreweights). 0 leaves the model free
+        everywhere: at low signal-to-noise ratios it then holds the positive half of the noise.
 
     blocks : int or str or list of str, default 0
         0 makes one block of each MeasurementSet, observation and scan, and splits long scans in
@@ -609,8 +619,9 @@ class _tsara:
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
         mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
         boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
-        reltol=0.0003, finalreltol=0.0003, regscale=1.0, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='',
-        fullsummary=False, report=False, restart=False, overwrite=False, savemodel='none', parallel=False,
+        reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, blocks=0, nthreads=0, dryrun=False,
+        maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False, overwrite=False, savemodel='none',
+        parallel=False,
     ):
         """Run the task."""
         values = dict(locals())
