@@ -8,7 +8,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from casa_sara.casa import log
-from casa_sara.casa.catalogue import list_islands
 from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import ImagePlane, define_image_plane
 from casa_sara.casa.images import read_model
@@ -23,7 +22,7 @@ from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOption
 from casa_sara.reconstruction import check_l2bound, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, UNFINISHED
-from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
+from casa_sara.solving import Watch, checkpoint_of, list_islands, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import Visibilities
 

@@ -26,6 +26,7 @@ CHECKPOINT = 16  # the dual and Φz
 # image planes, each 4 bytes a pixel
 PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
 NORM, NNLS, SOLVING, WRITING = 8, 4, 9, 10
+MATCHED = 11  # of the matched filters, while the support is found
 CUBES = 3  # psf, residual and model of each channel
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
@@ -57,6 +58,7 @@ class Workload:
     share: float = 1.0
     masked: bool = False
     whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
+    confined: bool = False
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
 
     @classmethod
@@ -67,6 +69,7 @@ class Workload:
                    len(crew.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
                    options.precondition, report and writes, grid.gridder, census.max_w, bool(grid.spectralindex), band,
                    channels, share, grid.masked, (census.samples, bases) if writes and crew.comm.size > 1 else (0, 0),
+                   options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    3 if options.method == "dabbech2018" else 2)
 
     def memory(self):
@@ -102,7 +105,7 @@ class Workload:
             phases["NNLS"] = solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
             coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
             phases["iterating"] = solver | {
-                "image planes": self._planes(PLANE + SOLVING), "re-weighting": PASSING * self.samples,
+                "image planes": self._planes(PLANE + SOLVING + MATCHED * self.confined), "re-weighting": PASSING * self.samples,
                 "wavelet duals and weights": self.duals * coefs, "wavelet workspace": workspace}
             if any(self.whole):
                 phases["writing a checkpoint"] = phases["iterating"] | {

@@ -10,7 +10,6 @@ import numpy as np
 
 from casa_sara.casa import log
 from casa_sara.casa.blockwords import divide
-from casa_sara.casa.catalogue import list_islands
 from casa_sara.casa.child import waiting_child
 from casa_sara.casa.imageplane import define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
@@ -33,7 +32,7 @@ from casa_sara.parallel import SERIAL
 from casa_sara.reconstruction import Reconstruction, operator_accuracy, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import UNFINISHED
-from casa_sara.solving import Watch, checkpoint_of, solve_image, without_wild
+from casa_sara.solving import Watch, checkpoint_of, list_islands, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import BlockInfo, Visibilities, sort_into_blocks
 from casa_sara.warmup import kernels_loading

@@ -140,9 +140,9 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
         schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
     run = solve_as_in_the_paper if options.method == PAPER else solve
     record = run(ppd, bounds, schedule, progress, stopped, keep, solution.stage)
-    if record.stop_code == CONVERGED and found.noise_only:
-        record.stop_code = NOISE_ONLY
     model = comm.own(ppd.model)
+    if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
+        record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
     noise_jy_per_beam = unit_jy * bounds.total_weight**-0.5
     return Reconstruction(model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,

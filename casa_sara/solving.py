@@ -8,6 +8,7 @@ import numpy as np
 
 import casa_sara
 from casa_sara.casa import log
+from casa_sara.casa.catalogue import located
 from casa_sara.casa.products import CHECKPOINT
 from casa_sara.casa.weights import sampling_density
 from casa_sara.deadline import Deadline
@@ -16,13 +17,15 @@ from casa_sara.parallel import SERIAL
 from casa_sara.reconstruction import reconstruct, schedule_of
 from casa_sara.sharing import ALONE
 from casa_sara.solver.checkpoint import Checkpoint
+from casa_sara.solver.islands import STRUCTURE
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
 from casa_sara.timing import Pace
 from casa_sara.visibilities import clock
 
-__all__ = ["Watch", "checkpoint_of", "solve_image", "without_wild"]
+__all__ = ["Watch", "checkpoint_of", "list_islands", "solve_image", "without_wild"]
 
 MOST_NAMED = 20  # wild samples that the log names one by one
+MOST_TOLD = 20  # islands of emission that the log lists
 
 
 @dataclass
@@ -122,3 +125,40 @@ def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):
     samples = comm.sum(np.diff(np.searchsorted(reconstruction.kept, offsets)))
     blocks = [replace(block, samples=int(count)) for block, count in zip(blocks, samples)]
     return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks
+
+
+def list_islands(record, plane, cell_rad, significance, comm=SERIAL):
+    """Give the islands of a model their places on the sky, list them in the log, and say whether the residual is noise.
+
+    Parameters
+    ----------
+    record : SolverRecord
+        Its islands are given `right_ascension` and `declination` (text, in the frame of the image) and `fwhm_arcsec`.
+    plane : ImagePlane
+    cell_rad : (float, float)
+        Pixel size.
+    significance : float
+        That was asked for.
+    comm : casa_sara.parallel.Serial or MPI
+        Ranks that share the work.
+    """
+    record.islands = comm.once(located, record.islands, plane, cell_rad)
+    _tell(record, significance)
+
+
+def _tell(record, significance):
+    if not record.residual_snr:
+        return
+    islands = record.islands
+    if not islands:
+        log.info(f"no emission of {significance:g} sigma or more: the model is empty")
+    else:
+        log.info(f"{len(islands)} islands of emission of {significance:g} sigma or more"
+                 + (f", the {MOST_TOLD} most significant:" if len(islands) > MOST_TOLD else ":"))
+    for island in islands[:MOST_TOLD]:
+        log.info(f"  {island['right_ascension']} {island['declination']}: {island['flux_jy']:.4g} +- "
+                 f"{island['flux_error_jy']:.2g} Jy, S/N {island['snr']:.3g}, FWHM {island['fwhm_arcsec']:.3g} arcsec")
+    worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"], default=None)
+    if worst and worst["snr"] > STRUCTURE:
+        log.warn(f"the residual is not noise: it reaches {worst['snr']:.3g} sigma when smoothed to {worst['beams']:g} beams; "
+                 "calibration errors, emission outside the image, or emission that the model cannot hold")

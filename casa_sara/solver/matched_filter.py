@@ -17,6 +17,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 from scipy.ndimage import label
+from scipy.signal import fftconvolve
 
 __all__ = ["MatchedFilter"]
 
@@ -24,6 +25,7 @@ BEAMS = (0.0, 1.0, 2.0, 4.0, 8.0)  # widths (FWHM) of the templates, in beams
 LARGEST = 0.25  # width of a template, of the shorter side of the image
 NEAR, NEAR_WIDE = 0.3, 0.05  # of the peak of the response of a point, and of wider templates
 LEAST_SIDELOBE, MOST_SIDELOBE, MARGIN = 0.25, 0.9, 1.2  # what sidelobes are taken for, and over the largest there is
+SQUARE = 1.5  # half the side of what is kept of a response, in widths of template and beam together
 SIGMA_TO_FWHM = np.sqrt(8 * np.log(2))
 
 
@@ -49,45 +51,61 @@ class MatchedFilter:
 
     def __init__(self, psf, workers=1):
         self.psf, self.shape, self._workers = psf, psf.shape, workers
-        self._centre = tuple(n // 2 for n in psf.shape)
-        self.beam = _beam(psf, self._centre)
+        self.beam = _beam(psf)
         self.widths = [width * self.beam for width in BEAMS if width * self.beam <= LARGEST * min(psf.shape)]
         self._padded = [fft.next_fast_len(int(n + 2 * (self.widths[-1] + self.beam)), real=True) for n in psf.shape]
-        self._psf_spectrum = self._spectrum(psf)
-        outside = np.where(self._near(psf, NEAR_WIDE), 0, psf).max() / psf[self._centre]
+        self._known = {}
+        outside = np.where(_near(psf, NEAR_WIDE), 0, psf).max() / psf[_centre(psf)]
         self.sidelobe = float(np.clip(MARGIN * outside, LEAST_SIDELOBE, MOST_SIDELOBE))
 
     def norm(self, scale):
         """‖Σ^{−½}Φq‖ of template number `scale`."""
-        transfer = self._template(self.widths[scale])
-        return float(np.sqrt(self._image(self._psf_spectrum * transfer * transfer)[self._centre]))
+        return self._response(scale)[0]
 
     def spectrum(self, image):
         """Return what :meth:`snr` takes for an image (nx, ny)."""
         return self._spectrum(image)
 
-    def snr(self, gradient, scale, model=None):
-        """Return T of template number `scale`, real (nx, ny).
+    def snr(self, gradient, scale):
+        """Return T of template number `scale` for the residual, real (nx, ny).
 
         Parameters
         ----------
         gradient : complex
             :meth:`spectrum` of Φ†Σ⁻¹(y − Φx).
         scale : int
-        model : real (nx, ny), optional
-            x, or that part of it which is not to be taken as known; without it, T of the residual.
         """
-        template = self._template(self.widths[scale])
-        found = gradient * template
-        if model is not None:
-            response = self._image(self._psf_spectrum * template)
-            response[~self._near(response, NEAR_WIDE if scale else NEAR)] = 0
-            near = np.zeros(self._padded, np.float32)
-            near[:self.shape[0], :self.shape[1]] = response
-            near = fft.rfft2(np.roll(near, [-c for c in self._centre], (0, 1)), workers=self._workers)
-            near *= self._spectrum(model)
-            found += near
+        found = gradient * self._template(self.widths[scale])
         return self._image(found) / np.float32(self.norm(scale))
+
+    def nearby(self, model, scale):
+        """Return what a model near each pixel adds to T of template number `scale`, real (nx, ny).
+
+        Parameters
+        ----------
+        model : real (nx, ny)
+            x, or that part of it which is not to be taken as known.
+        scale : int
+        """
+        norm, near = self._response(scale)
+        half = [n // 2 for n in near.shape]
+        kernel = np.zeros(self._padded, np.float32)
+        kernel[:near.shape[0], :near.shape[1]] = near
+        spectrum = fft.rfft2(np.roll(kernel, [-h for h in half], (0, 1)), workers=self._workers, overwrite_x=True)
+        spectrum *= self._spectrum(model)
+        return self._image(spectrum) / np.float32(norm)
+
+    def _response(self, scale):
+        """‖Σ^{−½}Φq‖, and K of a template where it is near, in a square around its middle."""
+        if scale not in self._known:
+            width = self.widths[scale]
+            half = int(np.ceil(SQUARE * (width + self.beam)))
+            psf = _square(self.psf, 2 * half)
+            response = fftconvolve(psf, _gaussian(half, width), mode="valid") if width else _square(psf, half)
+            norm = float(np.sqrt(np.vdot(response, _gaussian(half, width))))
+            near = np.where(_near(response, NEAR_WIDE if width else NEAR), response, 0)
+            self._known[scale] = norm, near.astype(np.float32)
+        return self._known[scale]
 
     def _spectrum(self, image):
         padded = np.zeros(self._padded, np.float32)
@@ -103,15 +121,41 @@ class MatchedFilter:
         decay = -2 * (np.pi * width / SIGMA_TO_FWHM) ** 2
         return np.exp(decay * kx**2).astype(np.float32)[:, None] * np.exp(decay * ky**2).astype(np.float32)
 
-    def _near(self, response, fraction):
-        """The disc around the centre out to where the response, averaged over circles, falls below a fraction."""
-        distance = np.hypot(*np.ogrid[tuple(slice(-c, n - c) for c, n in zip(self._centre, self.shape))])
-        ring = distance.astype(np.int32).ravel()
-        below = np.flatnonzero(np.bincount(ring, response.ravel()) < fraction * response[self._centre] * np.bincount(ring))
-        return distance < (below[0] if below.size else max(self.shape))
+
+def _centre(image):
+    return tuple(n // 2 for n in image.shape)
 
 
-def _beam(psf, centre):
+def _beam(psf):
     """FWHM of a circle as large as what is above half of the peak."""
-    labels = label(psf > 0.5 * psf[centre])[0]
-    return float(2 * np.sqrt(np.count_nonzero(labels == labels[centre]) / np.pi))
+    labels = label(psf > 0.5 * psf[_centre(psf)])[0]
+    return float(2 * np.sqrt(np.count_nonzero(labels == labels[_centre(psf)]) / np.pi))
+
+
+def _square(image, half):
+    """The square of 2 half + 1 pixels around the centre, zeros beyond the image."""
+    centre = _centre(image)
+    padded = np.pad(image, half) if min(image.shape) <= 2 * half + 1 else image
+    centre = [c + half * (padded is not image) for c in centre]
+    return padded[tuple(slice(c - half, c + half + 1) for c in centre)]
+
+
+def _gaussian(half, width):
+    """A Gaussian of unit sum in a square of 2 half + 1 pixels; a pixel of 1 where the width is 0."""
+    if not width:
+        return (_distance((2 * half + 1,) * 2) == 0).astype(float)
+    values = np.exp(-0.5 * (_distance((2 * half + 1,) * 2) * SIGMA_TO_FWHM / width) ** 2)
+    return values / values.sum()
+
+
+def _distance(shape):
+    """Distance of each pixel from that in the middle."""
+    return np.hypot(*np.ogrid[tuple(slice(-(n // 2), n - n // 2) for n in shape)])
+
+
+def _near(response, fraction):
+    """The disc around the centre out to where the response, averaged over circles, falls below a fraction of its peak."""
+    distance = _distance(response.shape)
+    ring = distance.astype(np.int32).ravel()
+    below = np.flatnonzero(np.bincount(ring, response.ravel()) < fraction * response[_centre(response)] * np.bincount(ring))
+    return distance < (below[0] if below.size else max(response.shape))

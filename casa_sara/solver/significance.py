@@ -19,6 +19,7 @@ __all__ = ["SignificantSupport", "gradient_image", "matched_filter"]
 GROWN = 0.5  # of the significance, down to which the surroundings belong to a source
 SURE = 10.0  # times the significance: what is believed of a model that nothing confines yet
 FAINT, CORE, RIM = 0.3, 0.5, 0.5  # of the significance, beside emission that is wider than the core, out to the rim, in widths
+PIXELS = 8  # across a width, at least, where cores are looked for
 EXCESS = 1.25  # residual over the noise level found, from which on the noise of the image is measured in the residual
 MEDIAN_TO_SIGMA = 1.482602218505602
 
@@ -77,7 +78,7 @@ class SignificantSupport:
         signed = (lambda snr: snr) if positivity else np.abs
         spectrum = filter_.spectrum(gradient)
         if not self.begun:
-            snr = signed(filter_.snr(spectrum, 0, model))
+            snr = signed(filter_.snr(spectrum, 0) + filter_.nearby(model, 0))
             level = np.clip(filter_.sidelobe * snr.max(), self.significance, SURE * self.significance)
             support = _connected(snr, level)
         else:
@@ -92,13 +93,13 @@ class SignificantSupport:
         rim, empty = found.copy(), model == 0
         significance = self.significance * _excess(filter_.snr(spectrum, 0), empty)
         for scale, width in enumerate(filter_.widths):
-            left = signed(filter_.snr(spectrum, scale))
-            level = max(significance, filter_.sidelobe * float(left.max(initial=0, where=empty)))
-            snr = signed(filter_.snr(spectrum, scale, np.where(found, 0, model)))
+            snr = filter_.snr(spectrum, scale)
+            level = max(significance, filter_.sidelobe * float(signed(snr).max(initial=0, where=empty)))
+            snr += filter_.nearby(np.where(found, 0, model), scale)
+            snr = signed(snr)
             found |= _connected(snr, level)
             if scale and level == significance:
-                core = minimum_filter(found, 2 * int(CORE * width) + 1)
-                rim |= maximum_filter(core, 2 * int((CORE + RIM) * width) + 1) & (snr >= FAINT * significance)
+                rim |= _around_cores(found, width) & (snr >= FAINT * significance)
         return found | rim
 
     def state(self):
@@ -142,6 +143,14 @@ def _connected(snr, level):
     chosen[labels[snr >= level]] = True
     chosen[0] = False
     return chosen[labels]
+
+
+def _around_cores(found, width):
+    """What is within RIM widths of the parts of a support that are CORE widths deep, on a grid that the width allows."""
+    step = max(1, int(width // PIXELS))
+    cores = minimum_filter(found[::step, ::step], 2 * int(CORE * width / step) + 1)
+    around = maximum_filter(cores, 2 * int((CORE + RIM) * width / step) + 1)
+    return np.repeat(np.repeat(around, step, axis=0), step, axis=1)[:found.shape[0], :found.shape[1]]
 
 
 def _excess(snr, empty):

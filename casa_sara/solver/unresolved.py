@@ -8,6 +8,7 @@ out of the data, the simplest model is that point.
 from __future__ import annotations
 
 import numpy as np
+from scipy import fft
 from scipy.ndimage import maximum_filter, shift
 from scipy.signal import fftconvolve
 
@@ -43,14 +44,14 @@ def unresolved(filter_, gradient, model, support, significance):
     points : bool (nx, ny)
         The pixels left to the points, a part of the support.
     """
-    snr = filter_.snr(filter_.spectrum(gradient), 0, model)
+    snr = filter_.snr(filter_.spectrum(gradient), 0) + filter_.nearby(model, 0)
     peaks = np.argwhere((snr == maximum_filter(snr, int(filter_.beam) | 1)) & (snr >= significance) & support)
     patch = _Patch(filter_)
     margin = patch.outer
     gradient, model, support = (np.pad(image, margin) for image in (gradient, model, support))
     given_up, points = np.zeros_like(support), np.zeros_like(support)
-    for peak in peaks + margin:
-        place = patch.point_at(gradient, model, peak)
+    for peak, level in zip(peaks + margin, snr[tuple(peaks.T)]):
+        place = patch.point_at(gradient, model, peak, level)
         if place is not None:
             given_up[patch.around(peak)] |= patch.disc
             points[patch.around(place)] |= patch.narrow
@@ -71,8 +72,10 @@ class _Patch:
         padded = np.pad(filter_.psf, half)
         self._psf = padded[tuple(slice(c - half, c + half + 1) for c in centre)]
         self._noise = float(self._psf[half, half]) ** -0.5
-        self._templates = [_template(self.outer, filter_.widths[k]) / filter_.norm(k)
-                           for k in range(min(TEMPLATES, len(filter_.widths)))]
+        self._size = [fft.next_fast_len(4 * self.outer + 1, real=True)] * 2
+        templates = [_template(self.outer, filter_.widths[k]) / filter_.norm(k)
+                     for k in range(min(TEMPLATES, len(filter_.widths)))]
+        self._templates = fft.rfft2(np.array(templates), self._size)
 
     @staticmethod
     def _sizes(beam):
@@ -83,24 +86,27 @@ class _Patch:
         """Slices of the patch around a pixel."""
         return tuple(slice(k - self.reach, k + self.reach + 1) for k in pixel)
 
-    def point_at(self, gradient, model, peak):
-        """The pixel of the one point that explains what is around a peak; None where none does."""
+    def point_at(self, gradient, model, peak, snr):
+        """The pixel of the one point that explains what is around a peak of this S/N; None where none does."""
         near = model[self.around(peak)] * self.disc
+        if near.sum() > self._noise * (ALL_BUT * snr + 5):
+            return None
         wide = tuple(slice(k - self.outer, k + self.outer + 1) for k in peak)
         # the gradient of the data without the other sources
         alone = gradient[wide] + fftconvolve(self._psf, near, mode="valid")
         o = self.outer
-        flux = alone[o, o] * self._noise**2
-        if near.sum() > ALL_BUT * flux + 5 * self._noise:
-            return None
         offset = [_vertex(alone[o - 1:o + 2, o]), _vertex(alone[o, o - 1:o + 2])]
-        psf = self._psf[self.reach - 3:-(self.reach - 3), self.reach - 3:-(self.reach - 3)]
-        psf = shift(psf, offset, order=3)[3:-3, 3:-3]
-        alone -= (alone[o, o] / psf[o, o]) * psf
-        for template in self._templates:
-            if np.abs(fftconvolve(alone, template, mode="same")[self._looked_at]).max() >= FITS:
-                return None
+        cut = self.reach - 3
+        psf = shift(self._psf[cut:-cut, cut:-cut], offset, order=3)[3:-3, 3:-3]
+        left = self._filtered(alone - (alone[o, o] / psf[o, o]) * psf)
+        if np.abs(left[:, self._looked_at]).max() >= FITS:
+            return None
         return [int(np.rint(k + by)) for k, by in zip(peak, offset)]
+
+    def _filtered(self, left):
+        """What is left, in standard deviations, by every template."""
+        filtered = fft.irfft2(fft.rfft2(left, self._size) * self._templates, self._size)
+        return filtered[:, self.outer:3 * self.outer + 1, self.outer:3 * self.outer + 1]
 
 
 def _vertex(three):
