@@ -99,10 +99,11 @@ class MatchedFilter:
         """‖Σ^{−½}Φq‖, and K of a template where it is near, in a square around its middle."""
         if scale not in self._known:
             width = self.widths[scale]
-            half = int(np.ceil(SQUARE * (width + self.beam)))
+            half = min(int(np.ceil(SQUARE * (width + self.beam))), (min(self._padded) - 1) // 2)
             psf = _square(self.psf, 2 * half)
             response = fftconvolve(psf, _gaussian(half, width), mode="valid") if width else _square(psf, half)
-            norm = float(np.sqrt(np.vdot(response, _gaussian(half, width))))
+            norm_sq = float(np.vdot(response, _gaussian(half, width)))
+            norm = np.sqrt(norm_sq) if norm_sq > 0 else np.inf  # where no baseline sees the template, T is 0
             near = np.where(_near(response, NEAR_WIDE if width else NEAR), response, 0)
             self._known[scale] = norm, near.astype(np.float32)
         return self._known[scale]

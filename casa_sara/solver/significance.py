@@ -20,7 +20,7 @@ GROWN = 0.5  # of the significance, down to which the surroundings belong to a s
 SURE = 10.0  # times the significance: what is believed of a model that nothing confines yet
 FAINT, CORE, RIM = 0.3, 0.5, 0.5  # of the significance, beside emission that is wider than the core, out to the rim, in widths
 PIXELS = 8  # across a width, at least, where cores are looked for
-EXCESS = 1.25  # residual over the noise level found, from which on the noise of the image is measured in the residual
+EXCESS, MOST_EXCESS = 1.25, 3.0  # residual over the noise level found, from which on the noise is that of the residual; more is sky
 MEDIAN_TO_SIGMA = 1.482602218505602
 
 
@@ -157,4 +157,4 @@ def _excess(snr, empty):
     """Noise of the residual image where the model is empty, in units of what it should be; 1 where it is not much more."""
     values = snr[empty] if 5 * np.count_nonzero(empty) > snr.size else snr
     noise = MEDIAN_TO_SIGMA * float(np.median(np.abs(values)))
-    return noise if noise > EXCESS else 1.0
+    return min(noise, MOST_EXCESS) if noise > EXCESS else 1.0

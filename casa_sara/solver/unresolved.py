@@ -19,6 +19,7 @@ __all__ = ["unresolved"]
 REACH = 1.75  # beams around a point in which there must be nothing else
 NARROW, FEWEST_PIXELS = 0.35, 1.0  # beams around a point, and pixels, in which the model may hold it
 FITS = 3.5  # standard deviations that may be left
+BRIGHTEST = 100.0  # S/N above which the data need no help, and a few pixels cannot hold a source between pixels
 TEMPLATES, TEMPLATE_REACH = 3, 2.5  # widths at which what is left is looked at; their reach in beams
 ALL_BUT = 1.5  # times as much flux as the point has, at most, and five standard deviations
 
@@ -45,7 +46,7 @@ def unresolved(filter_, gradient, model, support, significance):
         The pixels left to the points, a part of the support.
     """
     snr = filter_.snr(filter_.spectrum(gradient), 0) + filter_.nearby(model, 0)
-    peaks = np.argwhere((snr == maximum_filter(snr, int(filter_.beam) | 1)) & (snr >= significance) & support)
+    peaks = np.argwhere((snr == maximum_filter(snr, int(filter_.beam) | 1)) & (snr >= significance) & (snr < BRIGHTEST) & support)
     patch = _Patch(filter_)
     margin = patch.outer
     gradient, model, support = (np.pad(image, margin) for image in (gradient, model, support))
