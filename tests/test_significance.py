@@ -424,7 +424,6 @@ def test_at_the_edge_nothing_is_lost(sums, filter_, x, y):
     np.testing.assert_array_equal(points, distance(sums.shape, x, y) <= 1)
 
 
-@pytest.mark.xfail(strict=True, reason="pixels that only belonged to the point stay in the support beyond 1.75 beams")
 def test_what_belonged_to_a_point_alone_goes_with_it(sums, filter_):
     """A tongue of the region around a point, as noise above half of the significance makes them."""
     tongue = np.zeros(sums.shape, bool)
@@ -683,10 +682,7 @@ def test_weights_around_points_are_a_quarter():
     np.testing.assert_array_equal(both, where | weakened(("dirac", "db1"), [(2, 43)])[1])
 
 
-LONG = pytest.mark.xfail(strict=True, reason="long filters put their coefficients further from the point")
-
-
-@pytest.mark.parametrize("wavelet", ["db2", *(pytest.param(name, marks=LONG) for name in ("db4", "db6", "db8"))])
+@pytest.mark.parametrize("wavelet", ["db2", "db4", "db6", "db8"])
 def test_weights_around_points_are_a_quarter_where_their_coefficients_are(wavelet):
     """Of a point's power in the finest bands, most is in coefficients that have a quarter of the prior."""
     place = 21, 30

@@ -9,10 +9,12 @@ of the synthesis, which keeps the frame Parseval.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import pywt
+from scipy.ndimage import maximum_filter
 
 from casa_sara.operators import _wavelet_kernels as kernels
 from casa_sara.operators._wavelet_weights import RING_ROWS, neighbourhood_weights
@@ -204,6 +206,22 @@ class SaraDictionary:
         self._workers.run(neighbourhood_weights, out, self._rectangles, params, self._ring)
         return out
 
+    def scale_at(self, coefs, pixels, factor):
+        """Multiply the coefficients that describe some pixels, bool (nx, ny), and those beside them, in place."""
+        coefs = self._checked(coefs, "coefs", self.coef_shape)
+        plane = np.zeros(self.coef_shape[1:], bool)
+        plane[:self.shape[0], :self.shape[1]] = pixels
+        (nx, ny), blocks = plane.shape, {}
+        for level in range(1, self.levels + 1):
+            blocks[level] = plane.reshape(nx >> level, 1 << level, ny >> level, 1 << level).any(axis=(1, 3))
+            blocks[level] = maximum_filter(blocks[level], 3, mode="wrap")
+        for band in self.bands():
+            where = pixels
+            if band.level:
+                by = _displacement(self.wavelets[band.basis], band.level)
+                where = np.roll(blocks[band.level], [by[kind] for kind in band.orientation], (0, 1))
+            coefs[band.slice][where] *= self.dtype.type(factor)
+
     def _checked(self, array, name, shape):
         if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != self.dtype \
                 or not array.flags.c_contiguous:
@@ -218,6 +236,18 @@ class SaraDictionary:
         image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
         self._workers.run(kernels.analyse_finest, image, job)
         self._workers.run(kernels.transform_deeper, job, True, back)
+
+
+@cache
+def _displacement(wavelet, level):
+    """Coefficients by which approximations 'a' and details 'd' of a level lie off the block of pixels that they describe."""
+    size = 64 << level
+    pixel = np.zeros(size)
+    pixel[size // 2] = 1
+    approximation, detail = pywt.wavedec(pixel, wavelet, mode="periodization", level=level)[:2]
+    places = np.arange(approximation.size) - approximation.size // 2
+    return {kind: int(np.rint(np.vdot(coefs**2, places) / np.vdot(coefs, coefs)))
+            for kind, coefs in (("a", approximation), ("d", detail))}
 
 
 def _padded(shape, levels):

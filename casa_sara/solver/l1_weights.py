@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import maximum_filter
 
 __all__ = ["band_noise", "first_weights", "reweight"]
 
@@ -108,19 +107,6 @@ def reweight(ppd, bounds, scale, confined=False, points=None):
     alpha = scale * np.minimum(noise, pixel) / (scales if confined else 1.0)
     ppd.dictionary.reweight(ppd.model, alpha, scales * _shares(ppd, confined), ppd.l1_weights)
     if points is not None and points.any():
-        _weaken(ppd, points)
+        ppd.dictionary.scale_at(ppd.l1_weights, points, POINTS)
     ppd.rescale(SHRINK * ppd.threshold)
     bounds.apply_to(ppd)
-
-
-def _weaken(ppd, points):
-    """Multiply W by POINTS in the coefficients of every band that lie at the points, or beside them."""
-    plane = np.zeros(ppd.dictionary.coef_shape[1:], bool)
-    plane[:points.shape[0], :points.shape[1]] = points
-    at, nx, ny = {0: points}, *plane.shape
-    for level in range(1, ppd.dictionary.levels + 1):
-        blocks = plane.reshape(nx >> level, 1 << level, ny >> level, 1 << level).any(axis=(1, 3))
-        at[level] = maximum_filter(blocks, 3)
-    for band in ppd.dictionary.bands():
-        weights = ppd.l1_weights[band.slice]
-        weights[at[band.level]] *= weights.dtype.type(POINTS)

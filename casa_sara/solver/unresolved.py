@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import fft
-from scipy.ndimage import maximum_filter, shift
+from scipy.ndimage import label, maximum_filter, shift
 from scipy.signal import fftconvolve
 
 from casa_sara.solver.matched_filter import SIGMA_TO_FWHM
@@ -57,7 +57,17 @@ def unresolved(filter_, gradient, model, support, significance):
             given_up[patch.around(peak)] |= patch.disc
             points[patch.around(place)] |= patch.narrow
     inside = tuple(slice(margin, n - margin) for n in support.shape)
-    return ((support & ~given_up) | points)[inside], points[inside]
+    return (_without_fragments(support & ~given_up, given_up, patch.beam_area) | points)[inside], points[inside]
+
+
+def _without_fragments(support, given_up, area):
+    """A support without the parts smaller than this that lie at what was given up: what is left of a source's surroundings."""
+    labels, number = label(support)
+    sizes = np.bincount(labels.ravel(), minlength=number + 1)
+    beside = np.zeros(number + 1, bool)
+    beside[labels[maximum_filter(given_up, 3)]] = True
+    beside[0] = False
+    return support & ~(beside & (sizes < area))[labels]
 
 
 class _Patch:
@@ -67,6 +77,7 @@ class _Patch:
         self.reach, self.outer = self._sizes(filter_.beam)
         radius = _radius(self.reach)
         self.disc, self.narrow = radius <= REACH * filter_.beam, radius <= max(FEWEST_PIXELS, NARROW * filter_.beam)
+        self.beam_area = np.pi / 4 * filter_.beam**2
         self._looked_at = _radius(self.outer) <= REACH * filter_.beam
         half = self.reach + self.outer
         centre = [n // 2 + half for n in filter_.shape]
