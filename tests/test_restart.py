@@ -149,8 +149,10 @@ def test_a_signal_delivers_the_best_image_and_a_checkpoint(uninterrupted, ended,
     assert status == 0 and f"STOPPED WITH {STOPPED_BY_USER} 77" in output, output
     assert names_in(folder) == {"source.checkpoint", "source.sara.json", *(f"source.{product}" for product in PRODUCTS)}
     model = pixels(str(folder / "source.model"))
-    assert model.sum() > 1
     whole = pixels(uninterrupted[1] + ".model")
+    x, y = np.unravel_index(np.argmax(whole), whole.shape)
+    near = np.s_[x - 3 : x + 4, y - 3 : y + 4]  # so early the support holds the brightest sources only
+    assert model[near].sum() > 0.5 * whole[near].sum() > 0.3
     assert 0 < np.linalg.norm(model - whole) < 0.5 * np.linalg.norm(whole)
     with pytest.raises(FileExistsError, match="source.checkpoint'.*restart = True.*overwrite = True"):
         tsara(vis=vis, imagename=str(folder / "source"), **GRID)

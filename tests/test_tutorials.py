@@ -46,12 +46,12 @@ def test_first_image(tmp_path):
     before = resident_memory()
     truth, forecast, result, images = module.main(tmp_path)
     assert forecast["fits"] and 0.05e9 < forecast["peak_bytes"] - before < 0.5e9
-    assert result["stopcode"] == 101 and 250 <= result["iterdone"] <= 400
-    assert images["model"].sum() == pytest.approx(12.14, abs=0.15)
+    assert result["stopcode"] == 108 and 250 <= result["iterdone"] <= 400  # gain errors of 1 % leave structure
+    assert images["model"].sum() == pytest.approx(12.01, abs=0.15)
     assert module.snr_at_scale(truth, images["model"], 4) == pytest.approx(20.9, abs=0.5)
-    assert images["image"].max() / images["residual"].std() == pytest.approx(1880, rel=0.15)
+    assert images["image"].max() / images["residual"].std() == pytest.approx(1555, rel=0.15)
     found = [block["noise_found"] for block in result["sara"]["blocks"]]
-    assert len(found) == 6 and [min(found), max(found)] == pytest.approx([1.31, 1.64], abs=0.1)
+    assert len(found) == 6 and [min(found), max(found)] == pytest.approx([1.32, 1.65], abs=0.1)
     module.draw(tmp_path / "picture.png", truth, images)
     assert drawn(tmp_path / "picture.png")
     page_agrees("first_image", module.as_text(truth, forecast, result, images).split("\n", 1)[1])
