@@ -26,7 +26,7 @@ CHECKPOINT = 16  # the dual and Φz
 # image planes, each 4 bytes a pixel
 PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
 NORM, NNLS, SOLVING, WRITING = 8, 4, 9, 10
-MATCHED = 11  # of the matched filters, while the support is found
+MATCHED = 13  # of the matched filters, while the support is found
 CUBES = 3  # psf, residual and model of each channel
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run

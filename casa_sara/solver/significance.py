@@ -9,7 +9,7 @@ for.  Within it the prior needs to hold less (:mod:`casa_sara.solver.l1_weights`
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import label, maximum_filter, minimum_filter
+from scipy.ndimage import distance_transform_edt, label
 
 from casa_sara.solver.matched_filter import MatchedFilter
 from casa_sara.solver.unresolved import unresolved
@@ -148,8 +148,10 @@ def _connected(snr, level):
 def _around_cores(found, width):
     """What is within RIM widths of the parts of a support that are CORE widths deep, on a grid that the width allows."""
     step = max(1, int(width // PIXELS))
-    cores = minimum_filter(found[::step, ::step], 2 * int(CORE * width / step) + 1)
-    around = maximum_filter(cores, 2 * int((CORE + RIM) * width / step) + 1)
+    cores = distance_transform_edt(found[::step, ::step]) * step >= CORE * width
+    if not cores.any():
+        return np.zeros_like(found)
+    around = distance_transform_edt(~cores) * step <= (CORE + RIM) * width
     return np.repeat(np.repeat(around, step, axis=0), step, axis=1)[:found.shape[0], :found.shape[1]]
 
 
