@@ -18,9 +18,9 @@ __all__ = ["SignificantSupport", "gradient_image", "matched_filter"]
 
 GROWN = 0.5  # of the significance, down to which the surroundings belong to a source
 SURE = 10.0  # times the significance: what is believed of a model that nothing confines yet
-FAINT, CORE, RIM = 0.3, 0.5, 0.5  # of the significance, beside emission that is wider than the core, out to the rim, in widths
+FAINT, CORE, RIM = 0.3, 0.5, 0.5  # of the significance, beside emission deeper than the core, to the rim (in widths)
 PIXELS = 8  # across a width, at least, where cores are looked for
-EXCESS, MOST_EXCESS = 1.25, 3.0  # residual over the noise level found, from which on the noise is that of the residual; more is sky
+EXCESS, MOST_EXCESS = 1.25, 3.0  # residual over the noise found, from which on its own noise counts; more is sky
 MEDIAN_TO_SIGMA = 1.482602218505602
 
 

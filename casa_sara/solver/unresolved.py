@@ -46,7 +46,8 @@ def unresolved(filter_, gradient, model, support, significance):
         The pixels left to the points, a part of the support.
     """
     snr = filter_.snr(filter_.spectrum(gradient), 0) + filter_.nearby(model, 0)
-    peaks = np.argwhere((snr == maximum_filter(snr, int(filter_.beam) | 1)) & (snr >= significance) & (snr < BRIGHTEST) & support)
+    peaks = (snr == maximum_filter(snr, int(filter_.beam) | 1)) & (snr >= significance) & (snr < BRIGHTEST) & support
+    peaks = np.argwhere(peaks)
     patch = _Patch(filter_)
     margin = patch.outer
     gradient, model, support = (np.pad(image, margin) for image in (gradient, model, support))
