@@ -579,8 +579,10 @@ class _tsara:
     dict
       As tclean's: iterdone, niter, nmajordone, stopcode, stopDescription, summarymajor,
       summaryminor. Stop codes: 101 converged, 102 iteration limit, 103 noise only, 104 stopped by
-      user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit. The key 'sara' holds its own record: the
-      bound of each block with its snapshot, the history of re-weightings and iterations, the
+      user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit,
+      108 converged but the residual is not noise (more than 5 sigma over a beam or more).
+      The key 'sara' holds its own record: the islands of emission ('islands': place, flux with its
+      error, S/N, size), the largest S/N of the residual by width ('residual_snr'), the bound of each block with its snapshot, the history of re-weightings and iterations, the
       parameters that were chosen automatically and why, how many samples were dropped for
       which reason, and the iterations from which the run was resumed ('resumed').
 
