@@ -691,3 +691,15 @@ def test_weights_around_points_are_a_quarter_where_their_coefficients_are(wavele
     for band in dictionary.bands():
         if band.level in (1, 2):
             assert coefs[band.slice][where[band.slice]].sum() > 0.5 * coefs[band.slice].sum()
+
+
+def test_a_point_in_a_beam_of_one_pixel_is_found():
+    """Pixels as large as the beam: what is shifted of the response is then all of the patch."""
+    psf = np.zeros((32, 32), np.float32)
+    psf[15:18, 15:18], psf[16, 16] = 10, 110
+    gradient = np.zeros_like(psf)
+    gradient[10:13, 12:15], gradient[11, 13] = 15, 165
+    support = np.zeros(psf.shape, bool)
+    support[9:15, 10:17] = True
+    _, points = unresolved(MatchedFilter(psf), gradient, np.zeros_like(psf), support, 5.0)
+    assert points[11, 13] and np.count_nonzero(points) <= 5

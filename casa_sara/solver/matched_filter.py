@@ -19,7 +19,7 @@ from scipy import fft
 from scipy.ndimage import label
 from scipy.signal import fftconvolve
 
-__all__ = ["MatchedFilter"]
+__all__ = ["MatchedFilter", "distance", "gaussian"]
 
 BEAMS = (0.0, 1.0, 2.0, 4.0, 8.0)  # widths (FWHM) of the templates, in beams
 LARGEST = 0.25  # width of a template, of the shorter side of the image
@@ -62,10 +62,6 @@ class MatchedFilter:
         """‖Σ^{−½}Φq‖ of template number `scale`."""
         return self._response(scale)[0]
 
-    def spectrum(self, image):
-        """Return what :meth:`snr` takes for an image (nx, ny)."""
-        return self._spectrum(image)
-
     def snr(self, gradient, scale):
         """Return T of template number `scale` for the residual, real (nx, ny).
 
@@ -92,7 +88,7 @@ class MatchedFilter:
         kernel = np.zeros(self._padded, np.float32)
         kernel[:near.shape[0], :near.shape[1]] = near
         spectrum = fft.rfft2(np.roll(kernel, [-h for h in half], (0, 1)), workers=self._workers, overwrite_x=True)
-        spectrum *= self._spectrum(model)
+        spectrum *= self.spectrum(model)
         return self._image(spectrum) / np.float32(norm)
 
     def _response(self, scale):
@@ -101,14 +97,15 @@ class MatchedFilter:
             width = self.widths[scale]
             half = min(int(np.ceil(SQUARE * (width + self.beam))), (min(self._padded) - 1) // 2)
             psf = _square(self.psf, 2 * half)
-            response = fftconvolve(psf, _gaussian(half, width), mode="valid") if width else _square(psf, half)
-            norm_sq = float(np.vdot(response, _gaussian(half, width)))
+            response = fftconvolve(psf, gaussian(half, width), mode="valid") if width else _square(psf, half)
+            norm_sq = float(np.vdot(response, gaussian(half, width)))
             norm = np.sqrt(norm_sq) if norm_sq > 0 else np.inf  # where no baseline sees the template, T is 0
             near = np.where(_near(response, NEAR_WIDE if width else NEAR), response, 0)
             self._known[scale] = norm, near.astype(np.float32)
         return self._known[scale]
 
-    def _spectrum(self, image):
+    def spectrum(self, image):
+        """Return what :meth:`snr` takes for an image (nx, ny)."""
         padded = np.zeros(self._padded, np.float32)
         padded[:self.shape[0], :self.shape[1]] = image
         return fft.rfft2(padded, workers=self._workers, overwrite_x=True)
@@ -141,22 +138,22 @@ def _square(image, half):
     return padded[tuple(slice(c - half, c + half + 1) for c in centre)]
 
 
-def _gaussian(half, width):
+def gaussian(half, width):
     """A Gaussian of unit sum in a square of 2 half + 1 pixels; a pixel of 1 where the width is 0."""
     if not width:
-        return (_distance((2 * half + 1,) * 2) == 0).astype(float)
-    values = np.exp(-0.5 * (_distance((2 * half + 1,) * 2) * SIGMA_TO_FWHM / width) ** 2)
+        return (distance((2 * half + 1,) * 2) == 0).astype(float)
+    values = np.exp(-0.5 * (distance((2 * half + 1,) * 2) * SIGMA_TO_FWHM / width) ** 2)
     return values / values.sum()
 
 
-def _distance(shape):
+def distance(shape):
     """Distance of each pixel from that in the middle."""
     return np.hypot(*np.ogrid[tuple(slice(-(n // 2), n - n // 2) for n in shape)])
 
 
 def _near(response, fraction):
     """The disc around the centre out to where the response, averaged over circles, falls below a fraction of its peak."""
-    distance = _distance(response.shape)
-    ring = distance.astype(np.int32).ravel()
+    radius = distance(response.shape)
+    ring = radius.astype(np.int32).ravel()
     below = np.flatnonzero(np.bincount(ring, response.ravel()) < fraction * response[_centre(response)] * np.bincount(ring))
-    return distance < (below[0] if below.size else max(response.shape))
+    return radius < (below[0] if below.size else max(response.shape))

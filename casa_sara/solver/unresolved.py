@@ -12,7 +12,7 @@ from scipy import fft
 from scipy.ndimage import label, maximum_filter, shift
 from scipy.signal import fftconvolve
 
-from casa_sara.solver.matched_filter import SIGMA_TO_FWHM
+from casa_sara.solver.matched_filter import distance, gaussian
 
 __all__ = ["unresolved"]
 
@@ -75,25 +75,21 @@ class _Patch:
     """The surroundings of one source: `disc` and `narrow` are bool (2r + 1, 2r + 1)."""
 
     def __init__(self, filter_):
-        self.reach, self.outer = self._sizes(filter_.beam)
-        radius = _radius(self.reach)
+        self.reach = int(np.ceil(REACH * filter_.beam)) + 1
+        self.outer = self.reach + int(np.ceil(TEMPLATE_REACH * filter_.beam))
+        radius = distance((2 * self.reach + 1,) * 2)
         self.disc, self.narrow = radius <= REACH * filter_.beam, radius <= max(FEWEST_PIXELS, NARROW * filter_.beam)
         self.beam_area = np.pi / 4 * filter_.beam**2
-        self._looked_at = _radius(self.outer) <= REACH * filter_.beam
+        self._looked_at = distance((2 * self.outer + 1,) * 2) <= REACH * filter_.beam
         half = self.reach + self.outer
         centre = [n // 2 + half for n in filter_.shape]
         padded = np.pad(filter_.psf, half)
         self._psf = padded[tuple(slice(c - half, c + half + 1) for c in centre)]
         self._noise = float(self._psf[half, half]) ** -0.5
         self._size = [fft.next_fast_len(4 * self.outer + 1, real=True)] * 2
-        templates = [_template(self.outer, filter_.widths[k]) / filter_.norm(k)
+        templates = [gaussian(self.outer, filter_.widths[k]) / filter_.norm(k)
                      for k in range(min(TEMPLATES, len(filter_.widths)))]
         self._templates = fft.rfft2(np.array(templates), self._size)
-
-    @staticmethod
-    def _sizes(beam):
-        reach = int(np.ceil(REACH * beam)) + 1
-        return reach, reach + int(np.ceil(TEMPLATE_REACH * beam))
 
     def around(self, pixel):
         """Slices of the patch around a pixel."""
@@ -109,8 +105,8 @@ class _Patch:
         alone = gradient[wide] + fftconvolve(self._psf, near, mode="valid")
         o = self.outer
         offset = [_vertex(alone[o - 1:o + 2, o]), _vertex(alone[o, o - 1:o + 2])]
-        cut = self.reach - 3
-        psf = shift(self._psf[cut:-cut, cut:-cut], offset, order=3)[3:-3, 3:-3]
+        inner = slice(self.reach - 3, len(self._psf) - self.reach + 3)
+        psf = shift(self._psf[inner, inner], offset, order=3)[3:-3, 3:-3]
         left = self._filtered(alone - (alone[o, o] / psf[o, o]) * psf)
         if np.abs(left[:, self._looked_at]).max() >= FITS:
             return None
@@ -126,14 +122,3 @@ def _vertex(three):
     """Where the parabola through three values has its maximum, −1 … 1 from the middle."""
     curvature = three[0] - 2 * three[1] + three[2]
     return float(np.clip(0.5 * (three[0] - three[2]) / curvature, -1, 1)) if curvature < 0 else 0.0
-
-
-def _radius(half):
-    return np.hypot(*np.ogrid[-half:half + 1, -half:half + 1])
-
-
-def _template(half, width):
-    """A Gaussian of unit sum; a pixel of 1 where the width is 0."""
-    radius = _radius(half)
-    values = np.exp(-0.5 * (radius * SIGMA_TO_FWHM / width) ** 2) if width else (radius == 0).astype(float)
-    return values / values.sum()
