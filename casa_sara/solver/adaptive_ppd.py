@@ -6,6 +6,7 @@ import numpy as np
 
 from casa_sara.parallel import SERIAL
 from casa_sara.solver import _kernels as kernels
+from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.prox import ellipsoid_multiplier
 from casa_sara.solver.statefile import fill
 
@@ -74,7 +75,12 @@ class AdaptivePPD:
     anchor : real (nx, ny)
         z.
     lowest : real (nx, ny)
-        Least value of each pixel: 0, or −∞ without positivity; +∞ for pixels that stay 0, see :meth:`confine`.
+        Least value of each pixel: 0, or −∞ without positivity and for pixels of `points`; +∞ for pixels that stay 0, see
+        :meth:`confine`.
+    points : PointSources
+        Sources of which only the flux is free.
+    confined_to : bool (nx, ny) or None
+        The support of :meth:`confine`.
     l1_dual, l2_dual
         u and v.
     l1_weights
@@ -96,7 +102,7 @@ class AdaptivePPD:
         self.measurement, self.dictionary, self.comm = measurement, dictionary, comm
         self.vis, self.precond, self.offsets = vis, precond, np.asarray(offsets)
         self.relaxation, self.positivity = relaxation, positivity
-        self._confined_to = None
+        self.confined_to, self.points = None, PointSources()
         self.tau, self.l2_step = 0.495, 1.0 / data_norm_sq
         dtype = vis.real.dtype
         self.model, self.anchor, self.model_bar, self.lowest = comm.images(4, measurement.shape, dtype)
@@ -140,17 +146,24 @@ class AdaptivePPD:
 
     def confine(self, support):
         """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}."""
-        self._confined_to = support
+        self.confined_to = support
         self.lowest[~support] = np.inf
         self.comm.settle()
 
-    def support_only(self, support):
-        """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again."""
-        if self._confined_to is not None:
-            support = support & self._confined_to
-        self.comm.settle()  # all ranks of one machine have read
-        self.lowest[support & (self.lowest == np.inf)] = 0 if self.positivity else -np.inf
+    def support_only(self, support, points=PointSources()):
+        """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again.
+
+        At `points`, which the support holds, it is free in its flux only.
+        """
+        if self.confined_to is not None:
+            support = support & self.confined_to
+        free = 0 if self.positivity else -np.inf
+        self.comm.settle()  # all ranks of one machine have read, and write the same
+        self.lowest[self.points.x, self.points.y] = free
+        self.lowest[support & (self.lowest == np.inf)] = free
         self.lowest[~support] = np.inf
+        self.lowest[points.x, points.y] = -np.inf
+        self.points = points
         self.comm.settle()
 
     def start_from(self, model):
@@ -163,6 +176,7 @@ class AdaptivePPD:
 
     def step(self):
         """Do one iteration."""
+        points_before = self.points.values(self.model)
         # Steps 5–6: data
         self.measurement.forward(self.model_bar, self._phi_bar)
         self._data_step()
@@ -179,7 +193,13 @@ class AdaptivePPD:
                                      self.lowest, self._sums, part=self.comm.part)
         self.comm.settle()
         np.sqrt(norms_sq(), out=self.residual_norms)
-        sums = [*self._sums[:, :3].sum(axis=0).tolist(), float(self._sums[:, 3].max())]
+        sums, greatest = self._sums[:, :3].sum(axis=0), self._sums[:, 3].max()
+        if len(self.points):
+            if self.comm.part[0] == 0:
+                sums += self.points.project(self.model, self.anchor, self.model_bar, points_before)
+            self.comm.settle()
+            sums, greatest = np.maximum(sums, (0, 0, -np.inf)), self.model.max()
+        sums = [*sums.tolist(), float(greatest)]
         change, norm, self.model_flux, self.model_max = self.comm.lead(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
         self.iteration += 1
@@ -241,7 +261,8 @@ class AdaptivePPD:
             Plain values, and the arrays themselves.
         """
         arrays = {name: getattr(self, name) for name in STATE_ARRAYS}
-        return arrays | {name: getattr(self, name) for name in STATE_VALUES} | dict(l2_bounds=self.l2_bounds)
+        values = {name: getattr(self, name) for name in STATE_VALUES}
+        return arrays | values | dict(l2_bounds=self.l2_bounds, points=self.points.places)
 
     def set_state(self, state):
         """Take over what :meth:`state` has returned, by copies."""
@@ -253,3 +274,4 @@ class AdaptivePPD:
         for name in STATE_VALUES:
             setattr(self, name, state[name])
         self.l2_bounds = None if state["l2_bounds"] is None else np.array(state["l2_bounds"])
+        self.points = PointSources(state["points"])

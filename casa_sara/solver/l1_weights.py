@@ -87,11 +87,12 @@ def _shares(ppd, confined):
                      for band in ppd.dictionary.bands()])
 
 
-def reweight(ppd, bounds, scale, confined=False, points=None):
+def reweight(ppd, bounds, scale, confined=False):
     """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less.
 
     Within a support of what is significant (`confined`) the coarse bands cannot fill with noise any more, and the prior
-    may let go of them sooner: there α is scale × the noise of a coefficient of the model, that of a pixel over ν.
+    may let go of them sooner: there α is scale × the noise of a coefficient of the model, that of a pixel over ν.  Around
+    point sources W is a quarter.
 
     Parameters
     ----------
@@ -99,14 +100,12 @@ def reweight(ppd, bounds, scale, confined=False, points=None):
     bounds : GivenBounds or AdaptiveBounds
     scale : float
     confined : bool
-    points : bool (nx, ny), optional
-        Pixels of sources that one point explains: W is a quarter around them.
     """
     noise, pixel = band_noise(ppd, bounds)
     scales = _band_scales(noise, pixel)
     alpha = scale * np.minimum(noise, pixel) / (scales if confined else 1.0)
     ppd.dictionary.reweight(ppd.model, alpha, scales * _shares(ppd, confined), ppd.l1_weights)
-    if points is not None and points.any():
-        ppd.dictionary.scale_at(ppd.l1_weights, points, POINTS)
+    if len(ppd.points):
+        ppd.dictionary.scale_at(ppd.l1_weights, ppd.points.pixels(ppd.model.shape), POINTS)
     ppd.rescale(SHRINK * ppd.threshold)
     bounds.apply_to(ppd)

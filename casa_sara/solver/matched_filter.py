@@ -10,6 +10,9 @@ response K = Φ†Σ⁻¹Φq is above a fraction of its peak; with x_far the mod
     T = [q ⊛ Φ†Σ⁻¹(y − Φx) + (K where near) ⊛ x] / ‖Σ^{−½}Φq‖:
 
 what is left in the residual and what the model holds nearby, whatever noise the model has been fitted to.
+
+A template that reaches over the edge of the image is cut there, and then sees noise of baselines that average it away where it
+is whole: where ‖Σ^{−½}Φq‖ of the cut one is larger, T is divided by that.
 """
 
 from __future__ import annotations
@@ -42,7 +45,8 @@ class MatchedFilter:
     Attributes
     ----------
     beam : float
-        FWHM of the natural beam, of a circle of the same area, pixels.
+        FWHM of the natural beam, of a circle of the same area, pixels; without the plateau under it that baselines leave
+        which do not resolve the image, as those between the telescopes of one site.
     widths : list of float
         FWHM of the templates, pixels; the first is 0, a point.
     sidelobe : float
@@ -51,11 +55,12 @@ class MatchedFilter:
 
     def __init__(self, psf, workers=1):
         self.psf, self.shape, self._workers = psf, psf.shape, workers
-        self.beam = _beam(psf)
+        self._plateau = max(float(psf.mean()), 0.0)
+        self.beam = _beam(psf - self._plateau)
         self.widths = [width * self.beam for width in BEAMS if width * self.beam <= LARGEST * min(psf.shape)]
         self._padded = [fft.next_fast_len(int(n + 2 * (self.widths[-1] + self.beam)), real=True) for n in psf.shape]
-        self._known = {}
-        outside = np.where(_near(psf, NEAR_WIDE), 0, psf).max() / psf[_centre(psf)]
+        self._known, self._cut = {}, {}
+        outside = np.where(self._near(psf, NEAR_WIDE), 0, psf).max() / psf[_centre(psf)]
         self.sidelobe = float(np.clip(MARGIN * outside, LEAST_SIDELOBE, MOST_SIDELOBE))
 
     def norm(self, scale):
@@ -72,7 +77,7 @@ class MatchedFilter:
         scale : int
         """
         found = gradient * self._template(self.widths[scale])
-        return self._image(found) / np.float32(self.norm(scale))
+        return self._per_noise(self._image(found), scale)
 
     def nearby(self, model, scale):
         """Return what a model near each pixel adds to T of template number `scale`, real (nx, ny).
@@ -83,13 +88,28 @@ class MatchedFilter:
             x, or that part of it which is not to be taken as known.
         scale : int
         """
-        norm, near = self._response(scale)
+        near = self._response(scale)[1]
         half = [n // 2 for n in near.shape]
         kernel = np.zeros(self._padded, np.float32)
         kernel[:near.shape[0], :near.shape[1]] = near
         spectrum = fft.rfft2(np.roll(kernel, [-h for h in half], (0, 1)), workers=self._workers, overwrite_x=True)
         spectrum *= self.spectrum(model)
-        return self._image(spectrum) / np.float32(norm)
+        return self._per_noise(self._image(spectrum), scale)
+
+    def _per_noise(self, image, scale):
+        """Divide by ‖Σ^{−½}Φq‖ of the template around each pixel, in place."""
+        image /= np.float32(self.norm(scale))
+        if self.widths[scale]:
+            x, y = self._edges(scale)
+            image /= x[:, None]
+            image /= y[None, :]
+        return image
+
+    def _edges(self, scale):
+        """What the edges make of ‖Σ^{−½}Φq‖, as factors for every column and row; never below 1."""
+        if scale not in self._cut:
+            self._cut[scale] = [_cut_norms(psf, self.widths[scale]) for psf in (self.psf, self.psf.T)]
+        return self._cut[scale]
 
     def _response(self, scale):
         """‖Σ^{−½}Φq‖, and K of a template where it is near, in a square around its middle."""
@@ -100,9 +120,20 @@ class MatchedFilter:
             response = fftconvolve(psf, gaussian(half, width), mode="valid") if width else _square(psf, half)
             norm_sq = float(np.vdot(response, gaussian(half, width)))
             norm = np.sqrt(norm_sq) if norm_sq > 0 else np.inf  # where no baseline sees the template, T is 0
-            near = np.where(_near(response, NEAR_WIDE if width else NEAR), response, 0)
+            near = np.where(self._near(response, NEAR_WIDE if width else NEAR), response, 0)
             self._known[scale] = norm, near.astype(np.float32)
         return self._known[scale]
+
+    def _near(self, response, fraction):
+        """The disc around the centre out to where the response, averaged over circles, falls below a fraction of its peak.
+
+        Above the plateau of baselines that see the whole image as a point.
+        """
+        radius = distance(response.shape)
+        ring = radius.astype(np.int32).ravel()
+        least = self._plateau + fraction * (response[_centre(response)] - self._plateau)
+        below = np.flatnonzero(np.bincount(ring, response.ravel()) < least * np.bincount(ring))
+        return radius < (below[0] if below.size else max(response.shape))
 
     def spectrum(self, image):
         """Return what :meth:`snr` takes for an image (nx, ny)."""
@@ -151,9 +182,25 @@ def distance(shape):
     return np.hypot(*np.ogrid[tuple(slice(-(n // 2), n - n // 2) for n in shape)])
 
 
-def _near(response, fraction):
-    """The disc around the centre out to where the response, averaged over circles, falls below a fraction of its peak."""
-    radius = distance(response.shape)
-    ring = radius.astype(np.int32).ravel()
-    below = np.flatnonzero(np.bincount(ring, response.ravel()) < fraction * response[_centre(response)] * np.bincount(ring))
-    return radius < (below[0] if below.size else max(response.shape))
+def _cut_norms(psf, width):
+    """‖Σ^{−½}Φq‖ of a Gaussian that the edges of the first axis cut, over that of a whole one, at least 1: float32 (nx,).
+
+    q is a product a(x) b(y), so that ‖·‖² = Σ a(x) a(x′) p(x − x′), with p the response summed over y as b asks for.
+    """
+    nx, ny = psf.shape
+    half = min(int(np.ceil(SQUARE * width)), nx - 1)
+    a = np.exp(-0.5 * (np.arange(-half, half + 1) * SIGMA_TO_FWHM / width) ** 2)
+    b = np.exp(-0.25 * ((np.arange(ny) - ny // 2) * SIGMA_TO_FWHM / width) ** 2)  # the autocorrelation of b(y)
+    p = np.zeros(4 * half + 1)
+    lags = np.arange(nx) - nx // 2
+    seen = np.abs(lags) <= 2 * half
+    p[lags[seen] + 2 * half] = (psf @ b)[seen]
+    products = np.outer(a, a) * p[np.subtract.outer(np.arange(a.size), np.arange(a.size)) + 2 * half]
+    # the first k pixels of the template are what an edge leaves of it
+    norms_sq = np.diagonal(np.cumsum(np.cumsum(products, axis=0), axis=1))
+    ratio = np.sqrt(np.maximum(norms_sq[half:] / norms_sq[-1], 1)) if norms_sq[-1] > 0 else np.ones(half + 1)
+    factors = np.ones(nx, np.float32)
+    inside = np.minimum(np.arange(nx), np.arange(nx)[::-1])
+    near = inside <= half
+    factors[near] = ratio[inside[near]]
+    return factors

@@ -226,7 +226,7 @@ def _renew_weights(ppd, bounds, schedule, stage):
     stage.previous[...] = ppd.model
     support = stage.support
     pixels = support.update(ppd, bounds) if support else ppd.model.size
-    reweight(ppd, bounds, max(scale, LAST_SCALE), support is not None, support and support.points)
+    reweight(ppd, bounds, max(scale, LAST_SCALE), support is not None)
     stage.record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
                                           released=released, support=pixels))
     return True

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.ndimage import distance_transform_edt, label
 
 from casa_sara.solver.matched_filter import MatchedFilter
+from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.unresolved import unresolved
 
 __all__ = ["SignificantSupport", "gradient_image", "matched_filter"]
@@ -25,7 +26,7 @@ MEDIAN_TO_SIGMA = 1.482602218505602
 
 
 class SignificantSupport:
-    """The support of the model and the point sources in it.
+    """The support of the model, and the point sources in it.
 
     The first support holds what is sure of the first model, later ones what is significant in the residual and in the
     model that the support before allowed.  A level never lies below the sidelobes of what is still left.  Templates
@@ -39,15 +40,10 @@ class SignificantSupport:
     begun : bool
         Whether there is a support already.
 
-    Attributes
-    ----------
-    points : bool (nx, ny) or None
-        Pixels of sources that one point explains, see :mod:`casa_sara.solver.unresolved`.
     """
 
     def __init__(self, significance, begun=False):
         self.significance, self.begun = float(significance), bool(begun)
-        self.points = None
 
     def update(self, ppd, bounds):
         """Confine the model to what is significant now.
@@ -55,7 +51,7 @@ class SignificantSupport:
         Parameters
         ----------
         ppd : AdaptivePPD
-            Its support is changed.
+            Its support is changed, and its point sources.
         bounds : GivenBounds or AdaptiveBounds
             Whose noise levels are the noise.
 
@@ -66,14 +62,15 @@ class SignificantSupport:
         """
         gradient = gradient_image(ppd, bounds, ppd.model)
         psf = point_response(ppd, bounds)
-        support, self.points = ppd.comm.once(self._found, gradient, psf, ppd.model, ppd.positivity,
-                                             ppd.measurement.workers.count)
+        allowed = np.ones(ppd.model.shape, bool) if ppd.confined_to is None else ppd.confined_to
+        support, points = ppd.comm.once(self._found, gradient, psf, ppd.model, allowed, ppd.positivity,
+                                        ppd.measurement.workers.count)
         self.begun = True
-        ppd.support_only(support)
+        ppd.support_only(support, points)
         return int(np.count_nonzero(support))
 
-    def _found(self, gradient, psf, model, positivity, workers):
-        """Return the support and the points in it."""
+    def _found(self, gradient, psf, model, allowed, positivity, workers):
+        """Return the support and the point sources in it."""
         filter_ = MatchedFilter(psf, workers)
         signed = (lambda snr: snr) if positivity else np.abs
         spectrum = filter_.spectrum(gradient)
@@ -84,8 +81,8 @@ class SignificantSupport:
         else:
             support = self._grown(filter_, spectrum, model, signed)
         if not positivity or not support.any():
-            return support, np.zeros(support.shape, bool)
-        return unresolved(filter_, gradient, model, support, self.significance)
+            return support, PointSources()
+        return unresolved(filter_, gradient, model, support, allowed, self.significance)
 
     def _grown(self, filter_, spectrum, model, signed):
         """The support of a model that a support has confined already."""

@@ -2,7 +2,7 @@
 
 The prior prefers smooth sources, and where a source is faint the data do not contradict it: an unresolved source comes
 out as wide as the beam, and too faint where it is.  Of a source that leaves nothing significant when one point is taken
-out of the data, the simplest model is that point.
+out of the data, the simplest model is that point (:mod:`casa_sara.solver.point_sources`).
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from scipy.ndimage import label, maximum_filter, shift
 from scipy.signal import fftconvolve
 
 from casa_sara.solver.matched_filter import distance, gaussian
+from casa_sara.solver.point_sources import PointSources
 
 __all__ = ["unresolved"]
 
 REACH = 1.75  # beams around a point in which there must be nothing else
-NARROW, FEWEST_PIXELS = 0.35, 1.0  # beams around a point, and pixels, in which the model may hold it
 FITS = 3.5  # standard deviations that may be left
-BRIGHTEST = 100.0  # S/N above which the data need no help, and a few pixels cannot hold a source between pixels
+BRIGHTEST = 300.0  # S/N above which six pixels hold a source between pixels less well than the data need
 TEMPLATES, TEMPLATE_REACH = 3, 2.5  # widths at which what is left is looked at; their reach in beams
 ALL_BUT = 1.5  # times as much flux as the point has, at most, and five standard deviations
 
 
-def unresolved(filter_, gradient, model, support, significance):
-    """Narrow a support around the sources that one point explains.
+def unresolved(filter_, gradient, model, support, allowed, significance):
+    """Find the sources in a support that one point explains.
 
     Parameters
     ----------
@@ -35,30 +35,37 @@ def unresolved(filter_, gradient, model, support, significance):
     model : real (nx, ny)
         x.
     support : bool (nx, ny)
+    allowed : bool (nx, ny)
+        Where the pixels of a point may be.
     significance : float
         Least S/N of a point.
 
     Returns
     -------
     support : bool (nx, ny)
-        Without what is around the points.
-    points : bool (nx, ny)
-        The pixels left to the points, a part of the support.
+        With the pixels of the points, and without what is around them.
+    points : PointSources
     """
     snr = filter_.snr(filter_.spectrum(gradient), 0) + filter_.nearby(model, 0)
     peaks = (snr == maximum_filter(snr, int(filter_.beam) | 1)) & (snr >= significance) & (snr < BRIGHTEST) & support
     peaks = np.argwhere(peaks)
     patch = _Patch(filter_)
     margin = patch.outer
-    gradient, model, support = (np.pad(image, margin) for image in (gradient, model, support))
-    given_up, points = np.zeros_like(support), np.zeros_like(support)
+    gradient, model, free = np.pad(gradient, margin), np.pad(model, margin), np.pad(allowed, margin)
+    given_up, places = np.zeros_like(free), []
     for peak, level in zip(peaks + margin, snr[tuple(peaks.T)]):
         place = patch.point_at(gradient, model, peak, level)
-        if place is not None:
+        if place is None:
+            continue
+        point = PointSources([place])
+        if free[point.x, point.y].all():  # inside, and no pixel is another point's
+            free[point.x, point.y] = False
             given_up[patch.around(peak)] |= patch.disc
-            points[patch.around(place)] |= patch.narrow
-    inside = tuple(slice(margin, n - margin) for n in support.shape)
-    return (_without_fragments(support & ~given_up, given_up, patch.beam_area) | points)[inside], points[inside]
+            places.append(place)
+    points = PointSources(np.array(places).reshape(-1, 2) - margin)
+    given_up = given_up[tuple(slice(margin, margin + n) for n in support.shape)]
+    support = _without_fragments(support & ~given_up, given_up, patch.beam_area)
+    return support | points.pixels(support.shape), points
 
 
 def _without_fragments(support, given_up, area):
@@ -72,13 +79,12 @@ def _without_fragments(support, given_up, area):
 
 
 class _Patch:
-    """The surroundings of one source: `disc` and `narrow` are bool (2r + 1, 2r + 1)."""
+    """The surroundings of one source: `disc` is bool (2r + 1, 2r + 1)."""
 
     def __init__(self, filter_):
         self.reach = int(np.ceil(REACH * filter_.beam)) + 1
         self.outer = self.reach + int(np.ceil(TEMPLATE_REACH * filter_.beam))
-        radius = distance((2 * self.reach + 1,) * 2)
-        self.disc, self.narrow = radius <= REACH * filter_.beam, radius <= max(FEWEST_PIXELS, NARROW * filter_.beam)
+        self.disc = distance((2 * self.reach + 1,) * 2) <= REACH * filter_.beam
         self.beam_area = np.pi / 4 * filter_.beam**2
         self._looked_at = distance((2 * self.outer + 1,) * 2) <= REACH * filter_.beam
         half = self.reach + self.outer
@@ -96,7 +102,7 @@ class _Patch:
         return tuple(slice(k - self.reach, k + self.reach + 1) for k in pixel)
 
     def point_at(self, gradient, model, peak, snr):
-        """The pixel of the one point that explains what is around a peak of this S/N; None where none does."""
+        """The place of the one point that explains what is around a peak of this S/N; None where none does."""
         near = model[self.around(peak)] * self.disc
         if near.sum() > self._noise * (ALL_BUT * snr + 5):
             return None
@@ -110,7 +116,7 @@ class _Patch:
         left = self._filtered(alone - (alone[o, o] / psf[o, o]) * psf)
         if np.abs(left[:, self._looked_at]).max() >= FITS:
             return None
-        return [int(np.rint(k + by)) for k, by in zip(peak, offset)]
+        return [k + by for k, by in zip(peak, offset)]
 
     def _filtered(self, left):
         """What is left, in standard deviations, by every template."""

@@ -418,10 +418,11 @@ class _tsara:
         The primary beam above which the mask reaches; with usemask='user' it cuts the mask off.
 
     positivity : bool, default True
-        True for the brightness of the sky. Only beside an unresolved source that lies between pixels,
-        which positive pixels cannot hold, the model may become negative where the data ask for it (five
-        standard deviations, twice in a row), by at most a quarter of the source; the log says how many
-        pixels. A finer cell needs less of it. False is for skies with negative parts, such as the
+        True for the brightness of the sky. An unresolved source that lies between pixels cannot be held
+        by positive pixels. One that stands alone, of a signal-to-noise ratio below 300, is held by 6 x 6
+        pixels, some of them negative by at most a tenth of the source, which for the data are a point;
+        beside others the model may become negative where the data ask for it (three standard deviations,
+        twice in a row), by at most a quarter of the source; the log says how many pixels. False is for skies with negative parts, such as the
         decrement of the Sunyaev-Zeldovich effect; the model is then less constrained.
 
     precondition : bool, default True
@@ -495,7 +496,7 @@ class _tsara:
         The model is zero where the data show no emission of this many standard deviations, at the
         resolution of the natural beam or smoothed to 1, 2, 4 or 8 beams, so that extended emission
         counts with its sum. Where a source is found, its surroundings belong to it down to half of that.
-        A source that one point explains is modelled as one. Where the residual image is noisier than
+        A source that one point explains is modelled as a point, between pixels. Where the residual image is noisier than
         the visibilities (calibration errors), the standard deviation is that of the residual image.
         The islands of emission are listed in the log and in the record, with flux, error and
         signal-to-noise ratio. It is looked for at every re-weighting (nreweights). 0 leaves the model free
