@@ -6,6 +6,8 @@
     python benchmarks/quality.py FOLDER --only table   # the tables of docs/validation.md
     python benchmarks/quality.py FOLDER --only longer  # what ten times the iterations would change
 
+Skies stand on pixels three times smaller than the image's, and between them; `--oversampling 1` puts them on its own.
+
 tclean multiscale runs with Briggs −1 and natural weights. On the first case of every scene and array each of the
 settings in GRID is tried; the best against the truth, at half the beam, serves all cases of that scene and array
 (arrays other than the first, that of M31). `asp` runs on the first case of every scene. All run on one thread.
@@ -53,6 +55,7 @@ class Case:
     noise_scale: tuple[float, ...] = ()
     weight_scale: tuple[float, ...] = ()
     super_resolution: float = SUPER_RESOLUTION
+    oversampling: int = 3
 
     @property
     def label(self) -> str:
@@ -69,11 +72,19 @@ class Case:
     @property
     def tuned_on(self) -> Case:
         """The case whose tclean settings it takes."""
-        return Case(self.scene if self.array == "VLA A-D" else "M31", self.array)
+        return Case(self.scene if self.array == "VLA A-D" else "M31", self.array, oversampling=self.oversampling)
+
+    @property
+    def plain(self) -> bool:
+        """Whether it is the first of its scene."""
+        return self == Case(self.scene, oversampling=self.oversampling)
 
 
-def cases() -> list[Case]:
-    """Return the grid: every scene once, then one thing after the other on several of them."""
+def cases(oversampling: int = 3) -> list[Case]:
+    """Return the grid: every scene once, then one thing after the other on several of them.
+
+    The skies' pixels are `oversampling` times smaller than the image's; 1: they are the image's own.
+    """
     grid = [Case(scene) for scene in SCENES]
     for scene in ("M31", "3c353"):
         grid += [Case(scene, array=array) for array in list(ARRAYS)[1:]]
@@ -84,7 +95,7 @@ def cases() -> list[Case]:
         grid += [Case(scene, super_resolution=factor) for factor in (1.5, 2.5, 4.0)]
     for scene in ("cyga", "W28", "points off pixels"):
         grid += [Case(scene, noise_db=30.0), Case(scene, noise_db=40.0), Case(scene, gain_rms=0.03)]
-    return grid
+    return [replace(case, oversampling=oversampling) for case in grid]
 
 
 def simulation_of(case: Case, folder: Path):
@@ -93,7 +104,8 @@ def simulation_of(case: Case, folder: Path):
     observation = replace(array.observation, pointing_rms=case.pointing_rms, noise_scale=case.noise_scale,
                           weight_scale=case.weight_scale)
     array = Array(observation, array.configs)
-    sky = scene_sky(case.scene, nominal_cell_arcsec(array) / case.super_resolution)
+    sky = scene_sky(case.scene, nominal_cell_arcsec(array) / case.super_resolution,
+                    oversampling=case.oversampling)
     kept = folder / "blocks.json"
     if not kept.exists():
         from casa_sara.demo.imagers import quiet
@@ -258,17 +270,18 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", choices=("clean", "tsara", "table", "longer"))
     parser.add_argument("--cases", default="", help="only cases whose label holds this")
+    parser.add_argument("--oversampling", type=int, default=3, help="pixels of the sky in one of the image; 1: the image's own")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     base = options.folder.resolve()
-    grid = [case for case in cases() if options.cases in case.label]
+    grid = [case for case in cases(options.oversampling) if options.cases in case.label]
     if options.only == "longer":
-        compare_with_longer([case for case in grid if case == Case(case.scene) or case.gain_rms == 0.03], base)
+        compare_with_longer([case for case in grid if case.plain or case.gain_rms == 0.03], base)
     for case in grid:
         if options.only in ("table", "longer"):
             break
         found = cleaned(case, base)
-        if case == Case(case.scene) and options.only != "tsara":
+        if case.plain and options.only != "tsara":
             for weighting in WEIGHTINGS:
                 run_clean(case, base / case.folder, weighting, "asp")
         print(case.label, {name: round(result["0.5"], 1) for name, result in found.items()}, flush=True)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.io import fits
+from scipy.ndimage import map_coordinates
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -71,27 +72,42 @@ def nominal_cell_arcsec(array: Array) -> float:
     return 0.5 * SPEED_OF_LIGHT / array.observation.freq_hz / longest / ARCSEC
 
 
-def scene_sky(name: str, cell_arcsec: float = 0.06, flux_jy: float = FLUX_JY) -> Sky:
-    """Return a scene on pixels of `cell_arcsec`, scaled to a total flux; 'cyga' is the demo's."""
+def scene_sky(name: str, cell_arcsec: float = 0.06, flux_jy: float = FLUX_JY, oversampling: int = 1) -> Sky:
+    """Return a scene for an image with pixels of `cell_arcsec`, scaled to a total flux; 'cyga' is the demo's.
+
+    Its own pixels are `oversampling` times smaller. Where these are smaller than the file's, a reference sky is
+    interpolated by cubic splines and lies half a pixel of the image off its grid.
+    """
     if name == "cyga":
-        return replace(cyg_a_like(), cell_rad=cell_arcsec * ARCSEC / 2)
+        sky = cyg_a_like(oversampling=max(2, oversampling))
+        return replace(sky, cell_rad=cell_arcsec * ARCSEC / sky.oversampling)
     if name.startswith("points"):
-        return _points(cell_arcsec, flux_jy, on_pixels=name.endswith("on pixels"))
+        return _points(cell_arcsec, flux_jy, name.endswith("on pixels"), oversampling)
     file, background, how = REFERENCE[name]
     image = np.clip(fits.getdata(DATA / file).squeeze().T.astype(float) - background, 0, None)
     if how == "centre":
         first = (image.shape[0] - SIZE) // 2
         image = image[first : first + SIZE, first : first + SIZE]
-    elif how == "bin":
+    elif how == "bin" and oversampling == 1:
         image = image.reshape(SIZE, 2, SIZE, 2).sum(axis=(1, 3))
-    return Sky(image * (flux_jy / image.sum()), cell_arcsec * ARCSEC)
+    if oversampling > 1:
+        image = _between_pixels(image, SIZE * oversampling)
+    return Sky(image * (flux_jy / image.sum()), cell_arcsec * ARCSEC / oversampling, oversampling)
 
 
-def _points(cell_arcsec, flux_jy, on_pixels, number=60, seed=77):
+def _between_pixels(image, size):
+    """Interpolate an image to (size, size) by cubic splines, half a pixel of the image to be made off its grid; never negative."""
+    places = (np.arange(size) - size // 2) * (image.shape[0] / size) + image.shape[0] // 2 + 0.5 * image.shape[0] / SIZE
+    fine = map_coordinates(image, np.meshgrid(places, places, indexing="ij"), order=3, mode="constant")
+    return np.clip(fine, 0, None)
+
+
+def _points(cell_arcsec, flux_jy, on_pixels, oversampling=1, number=60, seed=77):
     """Unresolved sources over three decades of brightness, and as much flux again in extended emission below them."""
     rng = np.random.default_rng(seed)
-    x, y = np.meshgrid(*[np.arange(SIZE) - SIZE // 2] * 2, indexing="ij")
-    extended = np.zeros((SIZE, SIZE))
+    size = SIZE * oversampling
+    x, y = np.meshgrid(*[(np.arange(size) - size // 2) / oversampling] * 2, indexing="ij")
+    extended = np.zeros((size, size))
     for _ in range(25):
         (cx, cy), width = rng.normal(0, 30, 2), rng.uniform(5, 18)
         extended += rng.exponential() * np.exp(-((x - cx) ** 2 + (y - cy) ** 2) / (2 * width**2)) / width
@@ -100,17 +116,19 @@ def _points(cell_arcsec, flux_jy, on_pixels, number=60, seed=77):
     if on_pixels:
         places = np.rint(places)
     points = np.column_stack([places * cell_arcsec * ARCSEC, fluxes * (0.5 * flux_jy / fluxes.sum())])
-    return Sky(extended * (0.5 * flux_jy / extended.sum()), cell_arcsec * ARCSEC, points=points)
+    return Sky(extended * (0.5 * flux_jy / extended.sum()), cell_arcsec * ARCSEC / oversampling, oversampling, points)
 
 
 def smoothed_truth(sky: Sky, fwhm, position_angle_deg=0.0) -> np.ndarray:
     """Return the sky convolved with a Gaussian, its point sources at their places between the pixels, in Jy/pixel.
 
-    Parameters are those of :func:`casa_sara.analysis.metrics.smooth`, in pixels of the truth.
+    It is smoothed on its own pixels and sampled at those of the image. Parameters are those of
+    :func:`casa_sara.analysis.metrics.smooth`, in pixels of the image.
     """
-    smoothed = smooth(replace(sky, points=sky.points[:0]).truth(), fwhm, position_angle_deg)
+    k = sky.oversampling
+    smoothed = smooth(sky.image, np.multiply(fwhm, k), position_angle_deg)[::k, ::k] * k**2
     nx, ny = smoothed.shape
-    cell = sky.cell_rad * sky.oversampling
+    cell = sky.cell_rad * k
     major, minor = np.broadcast_to(fwhm, 2)
     sin, cos = np.sin(np.deg2rad(position_angle_deg)), np.cos(np.deg2rad(position_angle_deg))
     for l, m, flux in sky.points:

@@ -73,10 +73,11 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--cases", default="", help="only cases whose label holds this")
+    parser.add_argument("--oversampling", type=int, default=3, help="pixels of the sky in one of the image; 1: the image's own")
     parser.add_argument("--against", type=Path, help="the results of an earlier run")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
-    base, grid = options.folder.resolve(), [case for case in cases() if options.cases in case.label]
+    base, grid = options.folder.resolve(), [case for case in cases(options.oversampling) if options.cases in case.label]
     earlier = json.loads(options.against.read_text()) if options.against else {}
     print(f"{machine()}\n\n| case | iterations | SNR, dB | at half a beam | at one beam | bounds / true | |\n" + "|---" * 7 + "|")
     results = {}
