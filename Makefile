@@ -5,7 +5,7 @@ PYTHON ?= python3
 VENV ?= .venv
 python := $(abspath $(VENV))/bin/python
 
-.PHONY: test demo docs install tasks clean
+.PHONY: test demo docs install tasks dist clean
 
 test: install
 	$(python) -m pytest
@@ -23,8 +23,16 @@ install: $(VENV)/installed
 tasks:
 	$(PYTHON) tools/xml2task.py
 
+# The sdist and the wheel, in dist, built and checked with tools in an environment of their own.
+dist:
+	rm -rf dist
+	$(PYTHON) -m venv build/packaging
+	build/packaging/bin/python -m pip install --quiet --disable-pip-version-check build twine
+	build/packaging/bin/python -m build --outdir dist . >/dev/null
+	build/packaging/bin/python -m twine check --strict dist/*
+
 clean:
-	rm -rf $(VENV) build casa_sara.egg-info
+	rm -rf $(VENV) build dist casa_sara.egg-info
 
 # CASA's data and logs, for every Python of this environment that is not told otherwise: the data of
 # the package casadata, no download, no log file, nothing written to ~/.casa. A user's own
