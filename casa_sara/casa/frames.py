@@ -11,12 +11,13 @@ import numpy as np
 
 from casa_sara.casa.tools import opened
 
-__all__ = ["Geometry", "image_direction", "rotation_between", "separation"]
+__all__ = ["Geometry", "image_basis", "image_direction", "rotation_between", "separation"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 _FIXED_FRAMES = ("J2000", "ICRS", "B1950", "B1950_VLA", "GALACTIC", "SUPERGAL", "ECLIPTIC")
 _DOPPLER_STEP = 60.0  # s; linear interpolation is then good to 3e-12
-_SAME_DIRECTION = 1e-14  # rad, the round-off of an angle
+_NEAR_POLE = 0.005  # rad, within which directions are not converted one by one
+_SAME_DIRECTION = 1e-14  # of unit vectors, the round-off of an angle
 
 
 def _measures():
@@ -35,7 +36,17 @@ def image_direction(phasecenter, selected):
         tclean; a field number (int, or a str of digits), or '[FRAME] LONGITUDE LATITUDE'.
     selected : list of SelectedMS
     """
-    first = selected[0]
+    return _as_kept(_direction_of(phasecenter, selected[0]))
+
+
+def _as_kept(direction):
+    """Return a direction with the latitude that CASA's coordinates have: they keep unit vectors, so near a pole it is rounded."""
+    longitude, latitude = (direction[axis]["value"] for axis in ("m0", "m1"))
+    return _direction(direction["refer"], longitude, np.arcsin(np.sin(latitude)))
+
+
+def _direction_of(phasecenter, first):
+    """Return the direction measure that `phasecenter` stands for, of fields of the SelectedMS `first`."""
     text = str(phasecenter).strip()
     if text == "":
         return first.fields[min(first.fields)]
@@ -95,17 +106,53 @@ def _basis(direction):
     )
 
 
+def image_basis(direction):
+    """Return the axes of an image on the sky, in the frame of its centre.
+
+    They are east and north at its centre but for the north pole, where every direction is south: there CASA follows the
+    FITS standard, whose LONPOLE is then 0 and not 180, and both axes point the other way.
+
+    Parameters
+    ----------
+    direction : dict
+        Direction measure of the centre.
+
+    Returns
+    -------
+    float64 (3, 3)
+        Unit vectors: that of growing l (smaller x), that of growing m (larger y), and that to the centre.
+    """
+    basis = _basis(direction)
+    if direction["m1"]["value"] >= np.pi / 2:
+        basis[:2] *= -1
+    return basis
+
+
 def _converted(vector, frame, target, epoch_s):
-    """Return a unit vector of one direction frame in another one, at a time (MJD seconds, UTC) where it matters."""
-    direction = _direction(frame, np.arctan2(vector[1], vector[0]), np.arctan2(vector[2], np.hypot(*vector[:2])))
+    """Return a unit vector of one direction frame in another one, at a time (MJD seconds, UTC) where it matters.
+
+    CASA's matrices are unitary to 1e-11, and its latitude is the arcsine of the third component: within δ of a pole it is
+    wrong by 1e-11/δ, or NaN. There the mean of four vectors around is taken.
+    """
     me = _measures()
     if epoch_s is not None:
         me.doframe(me.epoch("UTC", f"{epoch_s!r}s"))
-    return _basis(me.measure(direction, target))[2]
+
+    def converted(one):
+        direction = _direction(frame, np.arctan2(one[1], one[0]), np.arctan2(one[2], np.hypot(*one[:2])))
+        return _basis(me.measure(direction, target))[2]
+
+    found = converted(vector)
+    if abs(found[2]) < np.cos(_NEAR_POLE):
+        return found
+    axes = np.linalg.svd(vector[None])[2][1:]  # two across the vector
+    mean = sum(converted(np.cos(4 * _NEAR_POLE) * vector + side * np.sin(4 * _NEAR_POLE) * axis)
+               for axis in axes for side in (-1, 1))
+    return mean / np.linalg.norm(mean)
 
 
 def rotation_between(field, image, epoch_s=None):
-    """Return the matrix that takes (u, v, w) at one phase centre to those at another.
+    """Return the matrix that takes (u, v, w) at one phase centre to those along the axes of an image at another.
 
     Parameters
     ----------
@@ -117,9 +164,9 @@ def rotation_between(field, image, epoch_s=None):
     Returns
     -------
     matrix : float64 (3, 3) or None
-        None when the two are the same direction in the same frame: nothing is to be done.
+        None when the two have the same axes in the same frame: nothing is to be done.
     """
-    basis_field, basis_image = _basis(field), _basis(image)
+    basis_field, basis_image = _basis(field), image_basis(image)
     if field["refer"] != image["refer"]:
         step, frames = 1e-3, (field["refer"], image["refer"], epoch_s)
         towards = _converted(basis_field[2], *frames)
@@ -127,7 +174,7 @@ def rotation_between(field, image, epoch_s=None):
         north = ahead - towards * (towards @ ahead)
         north /= np.linalg.norm(north)
         basis_field = np.array([np.cross(north, towards), north, towards])
-    elif np.linalg.norm(basis_field[2] - basis_image[2]) < _SAME_DIRECTION:
+    elif np.abs(basis_field - basis_image).max() < _SAME_DIRECTION:
         return None
     return basis_image @ basis_field.T
 
