@@ -13,6 +13,7 @@ from casa_sara.analysis.areas import Frame, places, region_masks
 from casa_sara.analysis.comparison import Comparison, Product
 from casa_sara.analysis.measuring import measure, source_support
 from casa_sara.casa import log
+from casa_sara.casa.fitsfiles import is_fits
 from casa_sara.casa.imageplane import define_image_plane
 from casa_sara.casa.imagesets import check_same_data, data_names, read_frames, read_image_set
 from casa_sara.casa.ms import read_visibilities
@@ -172,7 +173,7 @@ def _support(request, plane, frame, models, truth, beam, notes):
     text = request.support
     if not text:
         return source_support(models, truth, request.threshold, beam, frame.cell_arcsec)
-    if os.path.isdir(text) or text.endswith((".fits", ".mask")):
+    if os.path.isdir(text) or is_fits(text) or text.endswith((".fits", ".mask")):
         image = read_sky_image(text, "support", None)
         support = np.zeros(plane.shape, bool)
         if image.overlaps(plane):

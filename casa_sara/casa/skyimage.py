@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from casa_sara.casa.fitsfiles import opened_image
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.regrid import PixelMap, corners, interpolated, on_plane
-from casa_sara.casa.tools import opened
+from casa_sara.casa.units import brightness_unit
 
-__all__ = ["SkyImage", "SkyPlane", "beam_numbers", "read_header", "read_sky_image"]
+__all__ = ["SkyImage", "SkyPlane", "beam_numbers", "check_sky_axes", "read_header", "read_sky_image", "unit_of"]
 
-_SPELLINGS = {"jy/pixel": "Jy/pixel", "jy/pix": "Jy/pixel", "jy/beam": "Jy/beam", "jy/bm": "Jy/beam", "": ""}
 _PARAMETER = re.compile(r"(\w+)\s*=\s*(.*)")
 _LARGEST_TURN = 0.05  # pixels by which a corner may be off where a grid is of the same centre and axes
 
@@ -122,7 +122,7 @@ def read_sky_image(name, parameter, units):
     parameter : str
         Task parameter that named it, for messages.
     units : sequence of str or None
-        What is right here: out of 'Jy/pixel', 'Jy/beam', ''; None takes any.
+        What is right here: out of 'Jy/pixel', 'Jy/beam', ''; units that can be converted to these are. None takes any.
 
     Returns
     -------
@@ -136,19 +136,20 @@ def read_sky_image(name, parameter, units):
     if not os.path.exists(name):
         raise FileNotFoundError(f"{parameter} = '{name}' does not exist: it takes a CASA image or a FITS file")
     try:
-        with opened("image", name) as ia:
-            shape, unit, beam = tuple(int(n) for n in ia.shape()), ia.brightnessunit(), ia.restoringbeam()
+        with opened_image(name) as ia:
+            shape, given, beam = tuple(int(n) for n in ia.shape()), ia.brightnessunit(), ia.restoringbeam()
             csys, history = ia.coordsys(), ia.history(list=False)
-            _check_axes(name, parameter, shape, csys)
-            csys.setunits(["rad", "rad", *csys.units()[2:]])
+            check_sky_axes(name, parameter, csys)
+            _check_plane(name, parameter, shape, csys)
             pixels = read_pixels(ia)
     except RuntimeError as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
-    unit = _SPELLINGS.get(unit.lower(), unit)
+    unit, factor = unit_of(given, csys)
     if units is not None and unit not in units:
         right = " or ".join(f"'{word}'" for word in units if word)
         hint = "; the model is the image before it is convolved with the beam" if unit == "Jy/beam" else ""
-        raise ValueError(f"{parameter} = '{name}' is in '{unit}': should be in {right}{hint}")
+        raise ValueError(f"{parameter} = '{name}' is in '{given}': should be in {right}{hint}")
+    pixels *= np.float32(factor)
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
@@ -157,16 +158,36 @@ def read_sky_image(name, parameter, units):
 
 def read_header(name):
     """Return the beam of an image, None where it has none, and the task parameters in its history."""
-    with opened("image", name) as ia:
+    with opened_image(name) as ia:
         return beam_numbers(ia.restoringbeam()), _parameters(ia.history(list=False))
 
 
-def _check_axes(name, parameter, shape, csys):
-    """Raise unless the axes are two of the sky and at most one plane of others."""
-    axes = csys.axiscoordinatetypes()
-    if len(shape) < 2 or list(axes[:2]) != ["Direction", "Direction"]:
+def check_sky_axes(name, parameter, csys):
+    """Raise unless the first two axes are of the sky; bring these to radians."""
+    if list(csys.axiscoordinatetypes()[:2]) != ["Direction", "Direction"]:
         raise ValueError(f"{parameter} = '{name}' has the axes {', '.join(csys.names())}: should begin with right "
                          "ascension and declination")
+    csys.setunits(["rad", "rad", *csys.units()[2:]])
+
+
+def unit_of(text, csys):
+    """Return unit and factor of :func:`brightness_unit`; Jy/sr is brought to Jy/pixel by the solid angle of a pixel.
+
+    Parameters
+    ----------
+    text : str
+    csys : casatools.coordsys
+        Directions in radians.
+    """
+    unit, factor = brightness_unit(text)
+    if unit != "Jy/sr":
+        return unit, factor
+    sky = csys.torecord()["direction0"]
+    return "Jy/pixel", factor * float(abs(np.prod(sky["cdelt"]) * np.linalg.det(sky["pc"])))
+
+
+def _check_plane(name, parameter, shape, csys):
+    """Raise unless there is one plane, of Stokes I."""
     if int(np.prod(shape[2:])) != 1:
         raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one channel")
     stokes = csys.stokes() if csys.findcoordinate("stokes")["return"] else ["I"]
