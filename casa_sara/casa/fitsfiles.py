@@ -25,7 +25,8 @@ def is_fits(name):
 def readable(name):
     """Yield the name of an image that CASA can read: this one, or for a FITS file that it cannot, a temporary copy.
 
-    CASA reads the primary array and the first extension, uncompressed; of other files the copy holds the first image.
+    CASA reads the primary array and the first extension, uncompressed, and fails where CROTA turns the axes by 90 degrees;
+    of other files the copy holds the first image, with a PC matrix for CROTA.
 
     Raises
     ------
@@ -40,8 +41,9 @@ def readable(name):
     try:
         with fits.open(name) as hdus:
             number, image = next((k, hdu) for k, hdu in enumerate(hdus) if hdu.is_image and len(hdu.shape) > 1)
-            packed = number > 1 or isinstance(image, fits.CompImageHDU) or not _begins_as_fits(name)
-            data, header = (image.data, image.header) if packed else (None, None)
+            turned = any(image.header.get(key) for key in image.header["CROTA*"])
+            packed = number > 1 or turned or isinstance(image, fits.CompImageHDU) or not _begins_as_fits(name)
+            data, header = (image.data, _with_matrix(image.header) if turned else image.header) if packed else (None, None)
     except StopIteration:
         raise RuntimeError("the FITS file holds no image of two axes or more") from None
     except Exception as error:  # of many kinds, from the parser
@@ -60,6 +62,17 @@ def opened_image(name):
     """Open a CASA image or a FITS file with casatools' image tool; RuntimeError where it is none."""
     with readable(name) as path, opened("image", path) as ia:
         yield ia
+
+
+def _with_matrix(header):
+    """Return a header of FITS with a PC matrix in place of CROTA."""
+    from astropy.wcs import WCS
+
+    found = header.copy()
+    for key in list(header["CROTA*"]):
+        found.remove(key)
+    found.update(WCS(header).to_header())
+    return found
 
 
 def _begins_as_fits(name):

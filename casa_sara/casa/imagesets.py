@@ -121,10 +121,10 @@ def read_frames(names, plane):
     frames = []
     for given in names:
         path, root = _model_path(given, "frames")
-        image = read_sky_image(path, "frames", ("Jy/pixel",))
+        image = read_sky_image(path, "frames", ("Jy/pixel",)).upright()
         cell = np.degrees(image.plane.cell_rad) * 3600
-        if not image.is_aligned(plane):
-            raise ValueError(f"frames = '{given}' has another centre, or axes, than the first of models: should be "
+        if not image.plane.is_aligned(plane):
+            raise ValueError(f"frames = '{given}' has another centre than the first of models: should be "
                              "images of one field, with a pixel on one centre")
         if not np.isclose(*cell, rtol=1e-6):
             raise ValueError(f"frames = '{given}' has pixels of {cell[0]:.4g} x {cell[1]:.4g} arcsec: should be square")
