@@ -11,10 +11,13 @@ import numpy as np
 
 from casa_sara.casa.tools import opened
 
-__all__ = ["Geometry", "image_basis", "image_direction", "rotation_between", "separation"]
+__all__ = ["Geometry", "image_basis", "image_direction", "is_of_earth", "on_sky", "rotation_between", "separation",
+           "turn_to_frame", "unit_vectors"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 _FIXED_FRAMES = ("J2000", "ICRS", "B1950", "B1950_VLA", "GALACTIC", "SUPERGAL", "ECLIPTIC")
+_OF_EARTH = ("HADEC", "AZEL", "AZELSW", "AZELGEO", "AZELSWGEO", "ITRF")  # frames that turn with it
+_OF_OBJECTS = ("MERCURY", "VENUS", "MARS", "JUPITER", "SATURN", "URANUS", "NEPTUNE", "PLUTO", "SUN", "MOON", "COMET")
 _DOPPLER_STEP = 60.0  # s; linear interpolation is then good to 3e-12
 _NEAR_POLE = 0.005  # rad, within which directions are not converted one by one
 _SAME_DIRECTION = 1e-14  # of unit vectors, the round-off of an angle
@@ -33,10 +36,50 @@ def image_direction(phasecenter, selected):
     ----------
     phasecenter : str or int
         '' is the field of lowest number that is selected of the first MeasurementSet, as in
-        tclean; a field number (int, or a str of digits), or '[FRAME] LONGITUDE LATITUDE'.
+        tclean; a field number (int, or a str of digits), or '[FRAME] LONGITUDE LATITUDE'. A field in a frame that turns
+        with the Earth stands for where it is when the observation begins, in J2000.
     selected : list of SelectedMS
     """
-    return _as_kept(_direction_of(phasecenter, selected[0]))
+    first = selected[0]
+    return _as_kept(on_sky(_direction_of(phasecenter, first), first, first.start_s))
+
+
+def is_of_earth(direction):
+    """Tell whether the frame of a direction measure turns with the Earth, as azimuth and elevation do."""
+    return direction["refer"] in _OF_EARTH
+
+
+def on_sky(direction, ms, time_s):
+    """Return a direction of a field as one on the sky.
+
+    Parameters
+    ----------
+    direction : dict
+        Direction measure.
+    ms : SelectedMS
+        Where the telescope stands.
+    time_s : float
+        MJD seconds, UTC.
+
+    Returns
+    -------
+    dict
+        That in J2000 at this time where the frame turns with the Earth, else the same.
+
+    Raises
+    ------
+    ValueError
+        The frame is that of an object of the solar system.
+    """
+    if direction["refer"] in _OF_OBJECTS:
+        raise ValueError(f"vis = '{ms.name}': the direction of a field is that of {direction['refer']}: moving sources "
+                         "cannot be imaged, select other fields with field")
+    if not is_of_earth(direction):
+        return direction
+    me = _measures()
+    me.doframe(ms.position)
+    me.doframe(me.epoch("UTC", f"{time_s!r}s"))
+    return me.measure(direction, "J2000")
 
 
 def _as_kept(direction):
@@ -101,7 +144,7 @@ def _basis(direction):
         [
             [-sin(lon), cos(lon), 0.0],
             [-sin(lat) * cos(lon), -sin(lat) * sin(lon), cos(lat)],
-            [cos(lat) * cos(lon), cos(lat) * sin(lon), sin(lat)],
+            unit_vectors(lon, lat),
         ]
     )
 
@@ -166,17 +209,46 @@ def rotation_between(field, image, epoch_s=None):
     matrix : float64 (3, 3) or None
         None when the two have the same axes in the same frame: nothing is to be done.
     """
-    basis_field, basis_image = _basis(field), image_basis(image)
-    if field["refer"] != image["refer"]:
-        step, frames = 1e-3, (field["refer"], image["refer"], epoch_s)
-        towards = _converted(basis_field[2], *frames)
-        ahead = _converted(np.cos(step) * basis_field[2] + np.sin(step) * basis_field[1], *frames)
-        north = ahead - towards * (towards @ ahead)
-        north /= np.linalg.norm(north)
-        basis_field = np.array([np.cross(north, towards), north, towards])
-    elif np.abs(basis_field - basis_image).max() < _SAME_DIRECTION:
+    basis_field, basis_image = _basis_in(field, image["refer"], epoch_s), image_basis(image)
+    if field["refer"] == image["refer"] and np.abs(basis_field - basis_image).max() < _SAME_DIRECTION:
         return None
     return basis_image @ basis_field.T
+
+
+def _basis_in(direction, frame, epoch_s):
+    """Return the rows east, north and towards at a direction, of its own frame, as unit vectors of another one."""
+    basis = _basis(direction)
+    if direction["refer"] == frame:
+        return basis
+    step, frames = 1e-3, (direction["refer"], frame, epoch_s)
+    towards = _converted(basis[2], *frames)
+    ahead = _converted(np.cos(step) * basis[2] + np.sin(step) * basis[1], *frames)
+    north = ahead - towards * (towards @ ahead)
+    north /= np.linalg.norm(north)
+    return np.array([np.cross(north, towards), north, towards])
+
+
+def turn_to_frame(direction, frame, epoch_s=None):
+    """Return the matrix that takes unit vectors near a direction from its frame to another one.
+
+    Parameters
+    ----------
+    direction : dict
+        Direction measure.
+    frame : str
+    epoch_s : float, optional
+        As of :func:`rotation_between`.
+
+    Returns
+    -------
+    float64 (3, 3)
+    """
+    return _basis_in(direction, frame, epoch_s).T @ _basis(direction)
+
+
+def unit_vectors(longitude, latitude):
+    """Return the unit vectors (3, …) of directions in radians."""
+    return np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
 
 
 def separation(first, second):
@@ -201,9 +273,8 @@ class Geometry:
     """
 
     def __init__(self, ms, image):
-        self._ms = ms
-        self._rotations = {field: rotation_between(centre, image, ms.start_s) for field, centre in ms.fields.items()}
-        self._factors = {}
+        self._ms, self._image = ms, image
+        self._rotations, self._factors = {}, {}
         self.freq_range_hz = [np.inf, 0.0]
 
     def wavelengths(self, group, field, time, uvw_m):
@@ -228,15 +299,23 @@ class Geometry:
         self._note_range(group, factors)
         wave_number = group.freqs_hz / SPEED_OF_LIGHT * factors[:, None]
         rotated, turned = uvw_m, False
-        for number in np.unique(field):
-            matrix = self._rotations[int(number)]
+        for here, matrix in self._turns(field, time):
             if matrix is not None:
                 if not turned:
                     rotated, turned = uvw_m.copy(), True
-                here = field == number
                 rotated[:, here] = matrix @ uvw_m[:, here]
         shift = (rotated[2] - uvw_m[2])[:, None] * wave_number if turned else None
         return rotated[:, :, None] * wave_number, shift
+
+    def _turns(self, field, time):
+        """Yield the rows (bool) of each field, and of each time where it moves on the sky, with their `rotation_between`."""
+        for number in np.unique(field).tolist():
+            of_field, centre = field == number, self._ms.fields[number]
+            times = np.unique(time[of_field]).tolist() if is_of_earth(centre) else [self._ms.start_s]
+            for at in times:
+                if (number, at) not in self._rotations:
+                    self._rotations[number, at] = rotation_between(on_sky(centre, self._ms, at), self._image, self._ms.start_s)
+                yield of_field & (time == at) if len(times) > 1 else of_field, self._rotations[number, at]
 
     def frequencies(self, group, field, time):
         """Return the LSRK frequencies, float64 (R, C) in Hz, of rows as :meth:`wavelengths` takes them."""
@@ -267,7 +346,7 @@ class Geometry:
         if key not in self._factors:
             me = _measures()
             me.doframe(self._ms.position)
-            me.doframe(self._ms.fields[field])
+            me.doframe(on_sky(self._ms.fields[field], self._ms, time))
             me.doframe(me.epoch("UTC", f"{time!r}s"))
             self._factors[key] = me.measure(me.frequency(frame, "1Hz"), "LSRK")["m0"]["value"]
         return self._factors[key]

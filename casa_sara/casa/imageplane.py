@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casa_sara.casa.frames import image_basis
+from casa_sara.casa.frames import image_basis, unit_vectors
 from casa_sara.casa.integrity import reading
 from casa_sara.casa.quantities import check_frequency
 from casa_sara.casa.tools import opened, scratch_folder
@@ -126,8 +126,7 @@ def _check_coordinates(csys, center, grid):
     tool.fromrecord(csys)
     pixels = np.repeat(tool.referencepixel()["numeric"][:, None], 4, axis=1)
     pixels[:2] = half[:, None] + offsets
-    lon, lat = tool.toworldmany(pixels)["numeric"][:2]
-    labelled = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    labelled = unit_vectors(*tool.toworldmany(pixels)["numeric"][:2])
     apart = float(np.linalg.norm(imaged - labelled, axis=0).max() / cell.min())
     if not apart < _LARGEST_OFFSET:
         raise ValueError(f"phasecenter = '{grid.phasecenter}', projection = '{grid.projection}': CASA's coordinates of this "
