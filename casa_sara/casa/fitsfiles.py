@@ -15,10 +15,7 @@ _COMPRESSED = (b"\x1f\x8b", b"BZh", b"\xfd7zXZ")  # gzip, bzip2, xz
 
 def is_fits(name):
     """Tell whether a name is that of a FITS file, or of a compressed file, which is taken for one."""
-    if not os.path.isfile(name):
-        return False
-    with open(name, "rb") as file:
-        return file.read(len(_FITS)).startswith((_FITS, *_COMPRESSED))
+    return os.path.isfile(name) and os.access(name, os.R_OK) and _beginning(name).startswith((_FITS, *_COMPRESSED))
 
 
 @contextmanager
@@ -42,7 +39,7 @@ def readable(name):
         with fits.open(name) as hdus:
             number, image = next((k, hdu) for k, hdu in enumerate(hdus) if hdu.is_image and len(hdu.shape) > 1)
             turned = any(image.header.get(key) for key in image.header["CROTA*"])
-            packed = number > 1 or turned or isinstance(image, fits.CompImageHDU) or not _begins_as_fits(name)
+            packed = number > 1 or turned or isinstance(image, fits.CompImageHDU) or _beginning(name) != _FITS
             data, header = (image.data, _with_matrix(image.header) if turned else image.header) if packed else (None, None)
     except StopIteration:
         raise RuntimeError("the FITS file holds no image of two axes or more") from None
@@ -75,6 +72,6 @@ def _with_matrix(header):
     return found
 
 
-def _begins_as_fits(name):
+def _beginning(name):
     with open(name, "rb") as file:
-        return file.read(len(_FITS)) == _FITS
+        return file.read(len(_FITS))

@@ -11,8 +11,8 @@ import numpy as np
 
 from casa_sara.casa.tools import opened
 
-__all__ = ["Geometry", "image_basis", "image_direction", "is_of_earth", "on_sky", "rotation_between", "separation",
-           "turn_to_frame", "unit_vectors"]
+__all__ = ["Geometry", "direction_measure", "image_basis", "image_direction", "is_of_earth", "on_sky",
+           "rotation_between", "separation", "turn_to_frame", "unit_vectors"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 _FIXED_FRAMES = ("J2000", "ICRS", "B1950", "B1950_VLA", "GALACTIC", "SUPERGAL", "ECLIPTIC")
@@ -85,7 +85,7 @@ def on_sky(direction, ms, time_s):
 def _as_kept(direction):
     """Return a direction with the latitude that CASA's coordinates have: they keep unit vectors, so near a pole it is rounded."""
     longitude, latitude = (direction[axis]["value"] for axis in ("m0", "m1"))
-    return _direction(direction["refer"], longitude, np.arcsin(np.sin(latitude)))
+    return direction_measure(direction["refer"], longitude, np.arcsin(np.sin(latitude)))
 
 
 def _direction_of(phasecenter, first):
@@ -107,7 +107,7 @@ def _direction_of(phasecenter, first):
     angles = [_radians(word) for word in words[1:]]
     if None in angles:
         raise ValueError(f"phasecenter = '{phasecenter}' holds something that is not an angle: it takes {wanted}")
-    return _direction(frame, *angles)
+    return direction_measure(frame, *angles)
 
 
 def _radians(text):
@@ -122,7 +122,7 @@ def _radians(text):
     return angle["value"] if angle["unit"] == "rad" else None
 
 
-def _direction(frame, longitude, latitude):
+def direction_measure(frame, longitude, latitude):
     """Return the direction measure of two angles in radians."""
     angles = ({"unit": "rad", "value": float(angle)} for angle in (longitude, latitude))
     return {"type": "direction", "refer": frame, **dict(zip(("m0", "m1"), angles))}
@@ -182,7 +182,7 @@ def _converted(vector, frame, target, epoch_s):
         me.doframe(me.epoch("UTC", f"{epoch_s!r}s"))
 
     def converted(one):
-        direction = _direction(frame, np.arctan2(one[1], one[0]), np.arctan2(one[2], np.hypot(*one[:2])))
+        direction = direction_measure(frame, np.arctan2(one[1], one[0]), np.arctan2(one[2], np.hypot(*one[:2])))
         return _basis(me.measure(direction, target))[2]
 
     found = converted(vector)

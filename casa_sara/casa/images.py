@@ -101,7 +101,7 @@ def read_model(name, plane, channel=0):
             pixels = np.where(read_pixels(ia, True, number), read_pixels(ia, False, number), np.float32(0))
     except RuntimeError as error:
         raise ValueError(f"startmodel = '{name}' cannot be read as an image: {error}") from error
-    stokes = list(csys.stokes()) if csys.findaxisbyname("stokes", False) >= 0 else []
+    stokes = list(csys.stokes()) if csys.findcoordinate("stokes")["return"] else []
     wanted = plane.csys["stokes1"]["stokes"]
     if stokes and stokes != list(wanted):
         raise ValueError(f"startmodel = '{name}' is of Stokes {', '.join(stokes)}: should be of {', '.join(wanted)}")

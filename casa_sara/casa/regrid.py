@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from casa_sara.casa.frames import turn_to_frame, unit_vectors
+from casa_sara.casa.frames import direction_measure, turn_to_frame, unit_vectors
 from casa_sara.casa.imageplane import slabs
 
 __all__ = ["PixelMap", "corners", "interpolated", "on_plane"]
@@ -33,9 +33,15 @@ class PixelMap:
         self._to.fromrecord(plane.csys)
         self._rest = np.asarray(csys.referencepixel()["numeric"])[2:]
         self._values = np.asarray(self._to.referencevalue()["numeric"])[2:]
-        frame, center = self._to.referencecode("direction")[0], csys.referencevalue("m")["measure"]["direction"]
-        days = plane.csys["obsdate"]["m0"]["value"]
-        self._turn = None if center["refer"] == frame else turn_to_frame(center, frame, float(days) * 86400)
+        self._turn = self._to_frame(self._to.referencecode("direction")[0], plane.csys["obsdate"]["m0"]["value"])
+
+    def _to_frame(self, frame, days):
+        """Return the rotation to another frame of directions at a date (MJD), None where it is the same."""
+        own = self._from.referencecode("direction")[0]
+        if own == frame:
+            return None
+        longitude, latitude = self._from.referencevalue()["numeric"][:2]
+        return turn_to_frame(direction_measure(own, longitude, latitude), frame, float(days) * 86400)
 
     def __call__(self, x, y):
         """Return the pixel coordinates (2, N) of the pixel coordinates x, y (N,)."""

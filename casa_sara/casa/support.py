@@ -65,7 +65,7 @@ def _mask_of(entry, plane):
         root = os.path.join(folder, "support")
         _write_what_tclean_needs(root, plane)
         try:
-            wanted = _as_tclean_reads(os.path.abspath(entry), root + ".given") if os.path.exists(entry) else entry
+            wanted = _as_tclean_reads(entry, root + ".given")
             deconvolver.setupdeconvolution({
                 "imagename": root, "deconvolver": "hogbom", "specmode": "mfs", "startmodel": "", "restoringbeam": [],
                 "usemask": "user", "mask": wanted})
@@ -80,20 +80,24 @@ def _mask_of(entry, plane):
             return read_pixels(ia) > 0
 
 
-def _as_tclean_reads(name, copy):
-    """Return the name of a mask as tclean takes it: an image that is FITS, or lacks axes, is copied; others stay as they are."""
-    if not is_fits(name) and not os.path.isfile(os.path.join(name, "table.dat")):
-        return name  # a region, or a file of them
-    with opened_image(name) as ia:
-        csys = ia.coordsys()
-        check_sky_axes(name, "mask", csys)
-        stokes, spectral = (not csys.findcoordinate(kind)["return"] for kind in ("stokes", "spectral"))
-        if not (is_fits(name) or stokes or spectral):
-            return name
-        full = ia.adddegaxes(spectral=spectral, stokes="I" if stokes else "") if stokes or spectral else ia.subimage()
-        types = list(full.coordsys().axiscoordinatetypes())
-        full.transpose(copy, f"01{types.index('Stokes')}{types.index('Spectral')}").done()
-        full.done()
+def _as_tclean_reads(entry, copy):
+    """Return the name of a mask as tclean takes it.
+
+    Of an image that is FITS, or lacks axes, that is a copy, of which Stokes and frequency say nothing: tclean would
+    convert the latter, and fail where the telescope is not known.
+    """
+    if not is_fits(entry) and not os.path.isfile(os.path.join(entry, "table.dat")):
+        return os.path.abspath(entry) if os.path.exists(entry) else entry  # a region, or a file of them
+    with opened_image(entry) as ia:
+        csys, shape = ia.coordsys(), ia.shape()
+        check_sky_axes(entry, "mask", csys)
+        if not is_fits(entry) and all(csys.findcoordinate(kind)["return"] for kind in ("stokes", "spectral")):
+            return os.path.abspath(entry)
+        if shape[2:].prod() != 1:
+            raise ValueError(f"mask = '{entry}' has the shape {shape.tolist()}: should be one Stokes, one channel")
+        plane = ia.subimage(dropdeg=True)
+        plane.adddegaxes(copy, spectral=True, stokes="I").done()
+        plane.done()
     return copy
 
 

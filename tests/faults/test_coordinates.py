@@ -119,7 +119,7 @@ def test_the_check_holds_for_all_sizes_of_pixels(cell, centre):
     from casa_sara.options import ImageGrid, Selection
 
     selection = Selection((simulate("x.ms", antennas=6, scans=1, noise=0.1),), datacolumn="data")
-    data = replace(read_visibilities(selection), phase_center=frames._direction(*centre))
+    data = replace(read_visibilities(selection), phase_center=frames.direction_measure(*centre))
     imageplane.define_image_plane(data, selection, ImageGrid((1024, 512), (cell, 2 * cell)))
 
 
@@ -171,7 +171,7 @@ def test_directions_fixed_on_earth_are_astropys(frame, site):
     source = SkyCoord("19h59m28.5s", "+40d44m02s", frame="fk5")
     for date in DATES:
         time = Time(date, format="mjd", scale="utc")
-        direction = frames._direction(frame, *fixed_on_earth(frame, source, time, site))
+        direction = frames.direction_measure(frame, *fixed_on_earth(frame, source, time, site))
         found = frames.on_sky(direction, Telescope(site[0]), date * 86400)
         assert found["refer"] == "J2000"
         apart = basis(found["m0"]["value"], found["m1"]["value"])[2] - basis(source.ra.rad, source.dec.rad)[2]
@@ -220,4 +220,4 @@ def test_a_field_that_stands_still_over_the_earth_is_followed_on_the_sky(frame, 
 
 def test_the_direction_of_a_planet_is_refused_by_name(site):
     with pytest.raises(ValueError, match="vis = 'x.ms': the direction of a field is that of MARS"):
-        frames.on_sky(frames._direction("MARS", 0.0, 0.0), Telescope(site[0]), 57174.0 * 86400)
+        frames.on_sky(frames.direction_measure("MARS", 0.0, 0.0), Telescope(site[0]), 57174.0 * 86400)
