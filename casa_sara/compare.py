@@ -220,8 +220,8 @@ def _covered(plane, sets, notes):
     x, y = next(((x, y) for x, y in edges if known[x : nx - x, y : ny - y].all()), (0, 0))
     if not x:
         return plane
-    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, as far as the residual images reach: give vis for all of "
-                 "the first model")
+    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, as far as the residual images reach: give vis for all "
+                 "of the first model")
     return plane.trimmed((x, y))
 
 

@@ -83,7 +83,7 @@ def on_sky(direction, ms, time_s):
 
 
 def _as_kept(direction):
-    """Return a direction with the latitude that CASA's coordinates have: they keep unit vectors, so near a pole it is rounded."""
+    """Return a direction with the latitude of CASA's coordinates: these keep unit vectors, so near a pole it is rounded."""
     longitude, latitude = (direction[axis]["value"] for axis in ("m0", "m1"))
     return direction_measure(direction["refer"], longitude, np.arcsin(np.sin(latitude)))
 

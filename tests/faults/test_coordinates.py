@@ -110,7 +110,8 @@ def test_coordinates_that_are_not_those_of_the_pixels_are_refused(monkeypatch, m
 
 
 @pytest.mark.parametrize("cell", [1e-11, 1e-6, 1e-3])
-@pytest.mark.parametrize("centre", [("J2000", 1.0, np.pi / 2), ("GALACTIC", 4.0, -np.pi / 2), ("B1950", 6.0, 1.2), ("ICRS", 0.0, 0.0)])
+@pytest.mark.parametrize("centre", [("J2000", 1.0, np.pi / 2), ("GALACTIC", 4.0, -np.pi / 2), ("B1950", 6.0, 1.2),
+                                    ("ICRS", 0.0, 0.0)])
 def test_the_check_holds_for_all_sizes_of_pixels(cell, centre):
     """Of microarcseconds, and of images from horizon to horizon: no right one is refused."""
     from dataclasses import replace

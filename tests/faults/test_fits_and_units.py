@@ -158,8 +158,9 @@ def test_fits_without_the_sky_are_refused(vis):
 # Units ------------------------------------------------------------------------------------------
 
 SPELLINGS = {
-    "Jy/pixel": ("Jy/pixel", "pixel-1 Jy", "Jy pixel-1", "pix-1 Jy", "JY/PIX", "JY/PIXEL", "Jy/pix", "jy/Pixel", "Jy pixel**-1",
-                 "Jy*pixel^-1", "Jy.pixel-1", "Jansky/pixel", "JY PIXEL-1", "Jy per pixel", "Jy / (pixel)", " Jy/pixel ", '"JY/PIX"'),
+    "Jy/pixel": ("Jy/pixel", "pixel-1 Jy", "Jy pixel-1", "pix-1 Jy", "JY/PIX", "JY/PIXEL", "Jy/pix", "jy/Pixel",
+                 "Jy pixel**-1", "Jy*pixel^-1", "Jy.pixel-1", "Jansky/pixel", "JY PIXEL-1", "Jy per pixel", "Jy / (pixel)",
+                 " Jy/pixel ", '"JY/PIX"'),
     "Jy/beam": ("Jy/beam", "Jy beam-1", "JY/BEAM", "Jy/bm", "bm-1 Jy", "Jy.beam-1", "JY BEAM-1"),
 }
 FACTORS = {"mJy/pixel": ("Jy/pixel", 1e-3), "uJy/PIX": ("Jy/pixel", 1e-6), "µJy/pix": ("Jy/pixel", 1e-6),
