@@ -55,13 +55,13 @@ class SkyPlane:
     @property
     def _steps(self):
         """Steps to the east and to the north (rows) of one pixel along x and along y (columns), rad, before projection."""
-        sky = self.coordinates().torecord()["direction0"]
+        sky = self.csys["direction0"]
         return np.asarray(sky["cdelt"])[:, None] * np.asarray(sky["pc"]).T  # CASA's record has PC transposed
 
     @property
     def centre(self) -> tuple[float, float]:
         """Longitude and latitude in radians of pixel (nx//2, ny//2); at a pole the longitude that its axes go by."""
-        sky, middle = self.coordinates().torecord()["direction0"], [n // 2 for n in self.shape]
+        sky, middle = self.csys["direction0"], [n // 2 for n in self.shape]
         if np.abs(sky["crpix"] - middle).max() < _SAME_PLACE:
             return tuple(sky["crval"].tolist())
         return self.direction(*middle)
@@ -88,11 +88,12 @@ class SkyPlane:
             middle[old] = self.shape[old] // 2 if steps[new, old] > 0 else (self.shape[old] - 1) // 2
         centre = self.centre if middle == [n // 2 for n in self.shape] else self.direction(*middle)
         cell = [self.cell_rad[old] for old in along]
+        if self.is_aligned(self._laid_out(centre, cell, self.shape)):
+            return self
         # as many pixels as hold the corners
         place = PixelMap(self.coordinates(), self._laid_out(centre, cell, (1, 1)))(*corners(self.shape))
         before, after = (np.ceil(side.max(axis=1) - _LARGEST_TURN).astype(int) for side in (-place, place))
-        plane = self._laid_out(centre, cell, tuple(int(max(2 * b, 2 * a + 1, 1)) for b, a in zip(before, after)))
-        return self if self.shape == plane.shape and self.is_aligned(plane) else plane
+        return self._laid_out(centre, cell, tuple(int(max(2 * b, 2 * a + 1, 1)) for b, a in zip(before, after)))
 
     def _laid_out(self, centre, cell, shape):
         """Return a plane with pixel (nx//2, ny//2) at this centre, x to the west, y to the north and square corners."""
