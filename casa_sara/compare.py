@@ -13,6 +13,7 @@ from casa_sara.analysis.areas import Frame, places, region_masks
 from casa_sara.analysis.comparison import Comparison, Product
 from casa_sara.analysis.measuring import measure, source_support
 from casa_sara.casa import log
+from casa_sara.casa.fitsfiles import is_fits
 from casa_sara.casa.imageplane import define_image_plane
 from casa_sara.casa.imagesets import check_same_data, data_names, read_frames, read_image_set
 from casa_sara.casa.ms import read_visibilities
@@ -40,7 +41,8 @@ VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
 def compare_images(request: Comparing, selection: Selection | None = None, single: bool = False) -> Comparison:
     """Compare what several imagers made of one sky.
 
-    The pixels of the first model are the common grid. With a selection of visibilities, the residual of every model is
+    The pixels of the first model are the common grid; if it is turned, mirrored or not in SIN projection, pixels of this
+    size with x to the west and y to the north. With a selection of visibilities, the residual of every model is
     made of them with one operator and one set of weights; without, the residual images beside the models are used.
 
     Parameters
@@ -66,10 +68,14 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or B1950")
     if RADESYS[first.plane.frame] == "FK4":
         notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
-    frames = read_frames(request.frames, first.plane)
-    observed = _Observed(selection, first.plane, request, sets, notes) if selection else None
+    plane = first.plane.upright()
+    frames = read_frames(request.frames, plane)
+    observed = _Observed(selection, plane, request, sets, notes) if selection else None
     # one grid
-    plane = observed.plane if observed else first.plane
+    if observed:
+        plane = observed.plane
+    elif any(one.model.plane.upright() is not one.model.plane for one in sets):
+        plane = _covered(plane, sets, notes)
     models = {one.name: _on_grid(one.model, plane, first, "models", notes) for one in sets}
     truth = None
     if request.truth:
@@ -140,7 +146,8 @@ def _on_grid(image, plane, first, parameter, notes):
     if not model.any():
         raise ValueError(f"{parameter}: '{image.name}' has no flux within '{first.name}': should show the same sky")
     if model.shape != image.pixels.shape or not np.array_equal(model, image.pixels):
-        notes.append(f"'{image.name}' was put on the pixels of '{first.name}', its flux kept")
+        grid = "pixels along right ascension and declination" if image is first else f"the pixels of '{first.name}'"
+        notes.append(f"'{image.name}' was put on {grid}, its flux kept")
         if lost > LOST:
             notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies beyond '{first.name}'")
     return model
@@ -172,7 +179,7 @@ def _support(request, plane, frame, models, truth, beam, notes):
     text = request.support
     if not text:
         return source_support(models, truth, request.threshold, beam, frame.cell_arcsec)
-    if os.path.isdir(text) or text.endswith((".fits", ".mask")):
+    if os.path.isdir(text) or is_fits(text) or text.endswith((".fits", ".mask")):
         image = read_sky_image(text, "support", None)
         support = np.zeros(plane.shape, bool)
         if image.overlaps(plane):
@@ -200,6 +207,22 @@ def _inject(injected, plane, request, selection, sets, beams, measured):
             if "fwhm_arcsec" in source:
                 source["fwhm_in_beams"] = {name: source["fwhm_arcsec"] / width for name, width in widths.items()}
         measured[one.name]["injected"] = found
+
+
+def _covered(plane, sets, notes):
+    """Return the plane without the edges that a residual image beside the models does not reach, as one that is turned."""
+    known = np.ones(plane.shape, bool)
+    for one in sets:
+        if one.residual is not None and one.residual.overlaps(plane):
+            known &= np.isfinite(one.residual.brightness_on(plane))
+    nx, ny = plane.shape
+    edges = ((x, x * ny // nx) for x in range(nx // 2))
+    x, y = next(((x, y) for x, y in edges if known[x : nx - x, y : ny - y].all()), (0, 0))
+    if not x:
+        return plane
+    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, as far as the residual images reach: give vis for all "
+                 "of the first model")
+    return plane.trimmed((x, y))
 
 
 def _beside(sets, plane, notes):
@@ -282,7 +305,7 @@ class _Observed:
         known spectral index keeps its spectrum.
         """
         image = one.model
-        plane, pixels = (image.plane, image.pixels) if image.is_aligned(self.plane) else (self.plane, model)
+        plane, pixels = (image.plane, image.pixels) if image.plane.is_aligned(self.plane) else (self.plane, model)
         operator = self._operator(plane, f"models: '{image.name}'", spectral_index_of(one), image.plane)
         return self._data.vis - operator.forward(np.asarray(pixels, np.float32))
 

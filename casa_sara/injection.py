@@ -75,7 +75,7 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
     KeyboardInterrupt
         One of the runs was stopped by Ctrl-C.
     """
-    plane = one.model.plane
+    plane = one.model.plane.upright()
     cell = tuple(size / ARCSEC for size in plane.cell_rad)
     x, y = np.array(list(injection.places.values()), float).T
     places = PixelMap(injection.plane.coordinates(), plane)(x, y).T
@@ -99,7 +99,7 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
 
 def _repeat(one, places, flux, selection, nthreads):
     """Return the models of the same run on the visibilities as they are, and with the sources."""
-    plane = one.model.plane
+    plane = one.model.plane.upright()
     longitude, latitude = (float(angle) for angle in plane.centre)
     grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad",
                      gridder=one.parameters.get("gridder", "standard"), spectralindex=spectral_index_of(one))

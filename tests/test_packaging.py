@@ -53,7 +53,7 @@ ROOMS = {
     "outliers": {"casa_sara.noise", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
     "casa": {
         "casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.parallel", "casa_sara.sharing",
-        "casa_sara.snapshots", "casa_sara.visibilities", "numpy", "scipy", *CASA,
+        "casa_sara.snapshots", "casa_sara.visibilities", "numpy", "scipy", "astropy", *CASA,
     },
     "operators": {
         "casa_sara.options", "casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy", "finufft", "ducc0", "numba",

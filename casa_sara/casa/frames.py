@@ -11,12 +11,16 @@ import numpy as np
 
 from casa_sara.casa.tools import opened
 
-__all__ = ["Geometry", "image_direction", "rotation_between", "separation"]
+__all__ = ["Geometry", "direction_measure", "image_basis", "image_direction", "is_of_earth", "on_sky",
+           "rotation_between", "separation", "turn_to_frame", "unit_vectors"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 _FIXED_FRAMES = ("J2000", "ICRS", "B1950", "B1950_VLA", "GALACTIC", "SUPERGAL", "ECLIPTIC")
+_OF_EARTH = ("HADEC", "AZEL", "AZELSW", "AZELGEO", "AZELSWGEO", "ITRF")  # frames that turn with it
+_OF_OBJECTS = ("MERCURY", "VENUS", "MARS", "JUPITER", "SATURN", "URANUS", "NEPTUNE", "PLUTO", "SUN", "MOON", "COMET")
 _DOPPLER_STEP = 60.0  # s; linear interpolation is then good to 3e-12
-_SAME_DIRECTION = 1e-14  # rad, the round-off of an angle
+_NEAR_POLE = 0.005  # rad, within which directions are not converted one by one
+_SAME_DIRECTION = 1e-14  # of unit vectors, the round-off of an angle
 
 
 def _measures():
@@ -32,10 +36,60 @@ def image_direction(phasecenter, selected):
     ----------
     phasecenter : str or int
         '' is the field of lowest number that is selected of the first MeasurementSet, as in
-        tclean; a field number (int, or a str of digits), or '[FRAME] LONGITUDE LATITUDE'.
+        tclean; a field number (int, or a str of digits), or '[FRAME] LONGITUDE LATITUDE'. A field in a frame that turns
+        with the Earth stands for where it is when the observation begins, in J2000.
     selected : list of SelectedMS
     """
     first = selected[0]
+    return _as_kept(on_sky(_direction_of(phasecenter, first), first, first.start_s))
+
+
+def is_of_earth(direction):
+    """Tell whether the frame of a direction measure turns with the Earth, as azimuth and elevation do."""
+    return direction["refer"] in _OF_EARTH
+
+
+def on_sky(direction, ms, time_s):
+    """Return a direction of a field as one on the sky.
+
+    Parameters
+    ----------
+    direction : dict
+        Direction measure.
+    ms : SelectedMS
+        Where the telescope stands.
+    time_s : float
+        MJD seconds, UTC.
+
+    Returns
+    -------
+    dict
+        That in J2000 at this time where the frame turns with the Earth, else the same.
+
+    Raises
+    ------
+    ValueError
+        The frame is that of an object of the solar system.
+    """
+    if direction["refer"] in _OF_OBJECTS:
+        raise ValueError(f"vis = '{ms.name}': the direction of a field is that of {direction['refer']}: moving sources "
+                         "cannot be imaged, select other fields with field")
+    if not is_of_earth(direction):
+        return direction
+    me = _measures()
+    me.doframe(ms.position)
+    me.doframe(me.epoch("UTC", f"{time_s!r}s"))
+    return me.measure(direction, "J2000")
+
+
+def _as_kept(direction):
+    """Return a direction with the latitude of CASA's coordinates: these keep unit vectors, so near a pole it is rounded."""
+    longitude, latitude = (direction[axis]["value"] for axis in ("m0", "m1"))
+    return direction_measure(direction["refer"], longitude, np.arcsin(np.sin(latitude)))
+
+
+def _direction_of(phasecenter, first):
+    """Return the direction measure that `phasecenter` stands for, of fields of the SelectedMS `first`."""
     text = str(phasecenter).strip()
     if text == "":
         return first.fields[min(first.fields)]
@@ -53,7 +107,7 @@ def image_direction(phasecenter, selected):
     angles = [_radians(word) for word in words[1:]]
     if None in angles:
         raise ValueError(f"phasecenter = '{phasecenter}' holds something that is not an angle: it takes {wanted}")
-    return _direction(frame, *angles)
+    return direction_measure(frame, *angles)
 
 
 def _radians(text):
@@ -68,7 +122,7 @@ def _radians(text):
     return angle["value"] if angle["unit"] == "rad" else None
 
 
-def _direction(frame, longitude, latitude):
+def direction_measure(frame, longitude, latitude):
     """Return the direction measure of two angles in radians."""
     angles = ({"unit": "rad", "value": float(angle)} for angle in (longitude, latitude))
     return {"type": "direction", "refer": frame, **dict(zip(("m0", "m1"), angles))}
@@ -90,22 +144,58 @@ def _basis(direction):
         [
             [-sin(lon), cos(lon), 0.0],
             [-sin(lat) * cos(lon), -sin(lat) * sin(lon), cos(lat)],
-            [cos(lat) * cos(lon), cos(lat) * sin(lon), sin(lat)],
+            unit_vectors(lon, lat),
         ]
     )
 
 
+def image_basis(direction):
+    """Return the axes of an image on the sky, in the frame of its centre.
+
+    They are east and north at its centre but for the north pole, where every direction is south: there CASA follows the
+    FITS standard, whose LONPOLE is then 0 and not 180, and both axes point the other way.
+
+    Parameters
+    ----------
+    direction : dict
+        Direction measure of the centre.
+
+    Returns
+    -------
+    float64 (3, 3)
+        Unit vectors: that of growing l (smaller x), that of growing m (larger y), and that to the centre.
+    """
+    basis = _basis(direction)
+    if direction["m1"]["value"] >= np.pi / 2:
+        basis[:2] *= -1
+    return basis
+
+
 def _converted(vector, frame, target, epoch_s):
-    """Return a unit vector of one direction frame in another one, at a time (MJD seconds, UTC) where it matters."""
-    direction = _direction(frame, np.arctan2(vector[1], vector[0]), np.arctan2(vector[2], np.hypot(*vector[:2])))
+    """Return a unit vector of one direction frame in another one, at a time (MJD seconds, UTC) where it matters.
+
+    CASA's matrices are unitary to 1e-11, and its latitude is the arcsine of the third component: within δ of a pole it is
+    wrong by 1e-11/δ, or NaN. There the mean of four vectors around is taken.
+    """
     me = _measures()
     if epoch_s is not None:
         me.doframe(me.epoch("UTC", f"{epoch_s!r}s"))
-    return _basis(me.measure(direction, target))[2]
+
+    def converted(one):
+        direction = direction_measure(frame, np.arctan2(one[1], one[0]), np.arctan2(one[2], np.hypot(*one[:2])))
+        return _basis(me.measure(direction, target))[2]
+
+    found = converted(vector)
+    if abs(found[2]) < np.cos(_NEAR_POLE):
+        return found
+    axes = np.linalg.svd(vector[None])[2][1:]  # two across the vector
+    mean = sum(converted(np.cos(4 * _NEAR_POLE) * vector + side * np.sin(4 * _NEAR_POLE) * axis)
+               for axis in axes for side in (-1, 1))
+    return mean / np.linalg.norm(mean)
 
 
 def rotation_between(field, image, epoch_s=None):
-    """Return the matrix that takes (u, v, w) at one phase centre to those at another.
+    """Return the matrix that takes (u, v, w) at one phase centre to those along the axes of an image at another.
 
     Parameters
     ----------
@@ -117,19 +207,48 @@ def rotation_between(field, image, epoch_s=None):
     Returns
     -------
     matrix : float64 (3, 3) or None
-        None when the two are the same direction in the same frame: nothing is to be done.
+        None when the two have the same axes in the same frame: nothing is to be done.
     """
-    basis_field, basis_image = _basis(field), _basis(image)
-    if field["refer"] != image["refer"]:
-        step, frames = 1e-3, (field["refer"], image["refer"], epoch_s)
-        towards = _converted(basis_field[2], *frames)
-        ahead = _converted(np.cos(step) * basis_field[2] + np.sin(step) * basis_field[1], *frames)
-        north = ahead - towards * (towards @ ahead)
-        north /= np.linalg.norm(north)
-        basis_field = np.array([np.cross(north, towards), north, towards])
-    elif np.linalg.norm(basis_field[2] - basis_image[2]) < _SAME_DIRECTION:
+    basis_field, basis_image = _basis_in(field, image["refer"], epoch_s), image_basis(image)
+    if field["refer"] == image["refer"] and np.abs(basis_field - basis_image).max() < _SAME_DIRECTION:
         return None
     return basis_image @ basis_field.T
+
+
+def _basis_in(direction, frame, epoch_s):
+    """Return the rows east, north and towards at a direction, of its own frame, as unit vectors of another one."""
+    basis = _basis(direction)
+    if direction["refer"] == frame:
+        return basis
+    step, frames = 1e-3, (direction["refer"], frame, epoch_s)
+    towards = _converted(basis[2], *frames)
+    ahead = _converted(np.cos(step) * basis[2] + np.sin(step) * basis[1], *frames)
+    north = ahead - towards * (towards @ ahead)
+    north /= np.linalg.norm(north)
+    return np.array([np.cross(north, towards), north, towards])
+
+
+def turn_to_frame(direction, frame, epoch_s=None):
+    """Return the matrix that takes unit vectors near a direction from its frame to another one.
+
+    Parameters
+    ----------
+    direction : dict
+        Direction measure.
+    frame : str
+    epoch_s : float, optional
+        As of :func:`rotation_between`.
+
+    Returns
+    -------
+    float64 (3, 3)
+    """
+    return _basis_in(direction, frame, epoch_s).T @ _basis(direction)
+
+
+def unit_vectors(longitude, latitude):
+    """Return the unit vectors (3, …) of directions in radians."""
+    return np.array([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
 
 
 def separation(first, second):
@@ -154,9 +273,8 @@ class Geometry:
     """
 
     def __init__(self, ms, image):
-        self._ms = ms
-        self._rotations = {field: rotation_between(centre, image, ms.start_s) for field, centre in ms.fields.items()}
-        self._factors = {}
+        self._ms, self._image = ms, image
+        self._rotations, self._factors = {}, {}
         self.freq_range_hz = [np.inf, 0.0]
 
     def wavelengths(self, group, field, time, uvw_m):
@@ -181,15 +299,23 @@ class Geometry:
         self._note_range(group, factors)
         wave_number = group.freqs_hz / SPEED_OF_LIGHT * factors[:, None]
         rotated, turned = uvw_m, False
-        for number in np.unique(field):
-            matrix = self._rotations[int(number)]
+        for here, matrix in self._turns(field, time):
             if matrix is not None:
                 if not turned:
                     rotated, turned = uvw_m.copy(), True
-                here = field == number
                 rotated[:, here] = matrix @ uvw_m[:, here]
         shift = (rotated[2] - uvw_m[2])[:, None] * wave_number if turned else None
         return rotated[:, :, None] * wave_number, shift
+
+    def _turns(self, field, time):
+        """Yield the rows (bool) of each field, and of each time where it moves on the sky, with their `rotation_between`."""
+        for number in np.unique(field).tolist():
+            of_field, centre = field == number, self._ms.fields[number]
+            times = np.unique(time[of_field]).tolist() if is_of_earth(centre) else [self._ms.start_s]
+            for at in times:
+                if (number, at) not in self._rotations:
+                    self._rotations[number, at] = rotation_between(on_sky(centre, self._ms, at), self._image, self._ms.start_s)
+                yield of_field & (time == at) if len(times) > 1 else of_field, self._rotations[number, at]
 
     def frequencies(self, group, field, time):
         """Return the LSRK frequencies, float64 (R, C) in Hz, of rows as :meth:`wavelengths` takes them."""
@@ -220,7 +346,7 @@ class Geometry:
         if key not in self._factors:
             me = _measures()
             me.doframe(self._ms.position)
-            me.doframe(self._ms.fields[field])
+            me.doframe(on_sky(self._ms.fields[field], self._ms, time))
             me.doframe(me.epoch("UTC", f"{time!r}s"))
             self._factors[key] = me.measure(me.frequency(frame, "1Hz"), "LSRK")["m0"]["value"]
         return self._factors[key]

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casa_sara.casa.frames import image_basis, unit_vectors
 from casa_sara.casa.integrity import reading
 from casa_sara.casa.quantities import check_frequency
 from casa_sara.casa.tools import opened, scratch_folder
@@ -18,6 +19,7 @@ __all__ = ["ImagePlane", "define_image_plane", "read_pixels", "slabs"]
 
 PB_LIMIT = 0.2  # of tclean
 _SELECTDATA_KEYS = {"timerange": "timestr", "uvrange": "uvdist", "observation": "obs", "intent": "state"}
+_LARGEST_OFFSET = 0.05  # pixels between where a pixel is and where its coordinates say
 _SLAB = 4_000_000  # pixels read or written at a time
 
 
@@ -84,7 +86,7 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
     Raises
     ------
     ValueError
-        CASA cannot make coordinates of imsize, cell, projection and reffreq.
+        CASA cannot make coordinates of imsize, cell, projection and reffreq, or they are not those of the pixels.
     """
     if grid.reffreq:
         check_frequency(grid.reffreq, "reffreq")
@@ -96,12 +98,40 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
             csys, miscinfo = ia.coordsys().torecord(), ia.miscinfo()
         with opened("table", root + ".pb") as tb:
             imageinfo = tb.getkeyword("imageinfo")
+    _check_coordinates(csys, visibilities.phase_center, grid)
     # above 1 where several fields are imaged together
     pb /= np.maximum(pb.max(axis=(-2, -1), keepdims=True), np.float32(1))
     mask = pb > abs(pblimit)
     pb[~mask] = 0
     kept = {key: miscinfo[key] for key in ("INSTRUME", "distance") if key in miscinfo}
     return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept, masks_all=bool(pblimit >= 0))
+
+
+def _check_coordinates(csys, center, grid):
+    """Raise unless the coordinates give the corner pixels the places that imaging gives them.
+
+    That is s = l·e_x + m·e_y + √(1 − l² − m²)·e_z with (e_x, e_y, e_z) of :func:`casa_sara.casa.frames.image_basis`,
+    l = (nx//2 − x)·cell and m = (y − ny//2)·cell.
+    """
+    import casatools
+
+    # the corners, or as far out as is well this side of the horizon
+    half, cell = np.array(grid.shape) // 2, np.array(grid.cell_rad)
+    inward = min(1.0, 0.5 / np.hypot(*(half * cell)))
+    offsets = np.array([[-1, 1, -1, 1], [-1, -1, 1, 1]]) * (half * inward)[:, None]
+    l, m = -offsets[0] * cell[0], offsets[1] * cell[1]
+    # once by our rule, once by the coordinates
+    imaged = image_basis(center).T @ np.array([l, m, np.sqrt(1 - l**2 - m**2)])
+    tool = casatools.coordsys()
+    tool.fromrecord(csys)
+    pixels = np.repeat(tool.referencepixel()["numeric"][:, None], 4, axis=1)
+    pixels[:2] = half[:, None] + offsets
+    labelled = unit_vectors(*tool.toworldmany(pixels)["numeric"][:2])
+    apart = float(np.linalg.norm(imaged - labelled, axis=0).max() / cell.min())
+    if not apart < _LARGEST_OFFSET:
+        raise ValueError(f"phasecenter = '{grid.phasecenter}', projection = '{grid.projection}': CASA's coordinates of this "
+                         f"image differ from the places of its pixels by up to {apart:.3g} pixels: should be another "
+                         "phasecenter, as 'J2000 19h59m28.5s +40d44m02s'")
 
 
 def read_pixels(ia, getmask=False, number=0):

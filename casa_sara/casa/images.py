@@ -7,9 +7,11 @@ import os
 
 import numpy as np
 
+from casa_sara.casa.fitsfiles import opened_image
 from casa_sara.casa.imageplane import read_pixels, slabs
 from casa_sara.casa.quantities import radians
 from casa_sara.casa.regrid import PixelMap, on_plane
+from casa_sara.casa.skyimage import check_sky_axes, unit_of
 from casa_sara.casa.tools import opened
 
 __all__ = ["read_model", "write_image"]
@@ -71,7 +73,7 @@ def read_model(name, plane, channel=0):
     Parameters
     ----------
     name : str
-        A CASA image in Jy/pixel.
+        A CASA image or a FITS file in Jy/pixel, or a unit that can be converted to it.
     plane : ImagePlane
     channel : int
         Of the image; a model of one channel serves all of them.
@@ -85,11 +87,12 @@ def read_model(name, plane, channel=0):
     FileNotFoundError, ValueError
         `startmodel` is absent, no image of one plane, not in Jy/pixel, or not finite.
     """
-    if not os.path.isdir(name):
-        raise FileNotFoundError(f"startmodel = '{name}' does not exist")
+    if not os.path.exists(name):
+        raise FileNotFoundError(f"startmodel = '{name}' does not exist: it takes a CASA image or a FITS file")
     try:
-        with opened("image", name) as ia:
-            shape, unit, csys = tuple(ia.shape()), ia.brightnessunit(), ia.coordsys()
+        with opened_image(name) as ia:
+            shape, given, csys = tuple(ia.shape()), ia.brightnessunit(), ia.coordsys()
+            check_sky_axes(name, "startmodel", csys)
             planes = int(np.prod(shape[2:]))
             if len(shape) < 2 or planes not in (1, plane.channels) or planes != max(shape[2:], default=1):
                 right = f"one channel, or {plane.channels}" if plane.channels > 1 else "one channel"
@@ -98,22 +101,23 @@ def read_model(name, plane, channel=0):
             pixels = np.where(read_pixels(ia, True, number), read_pixels(ia, False, number), np.float32(0))
     except RuntimeError as error:
         raise ValueError(f"startmodel = '{name}' cannot be read as an image: {error}") from error
-    stokes = list(csys.stokes()) if csys.findaxisbyname("stokes", False) >= 0 else []
+    stokes = list(csys.stokes()) if csys.findcoordinate("stokes")["return"] else []
     wanted = plane.csys["stokes1"]["stokes"]
     if stokes and stokes != list(wanted):
         raise ValueError(f"startmodel = '{name}' is of Stokes {', '.join(stokes)}: should be of {', '.join(wanted)}")
+    unit, factor = unit_of(given, csys)
     if unit != "Jy/pixel":
-        raise ValueError(f"startmodel = '{name}' is in '{unit}': it takes 'Jy/pixel'{_conversion(name, unit)}")
+        raise ValueError(f"startmodel = '{name}' is in '{given}': it takes 'Jy/pixel'{_conversion(name, unit)}")
     if not np.isfinite(pixels).all():
         raise ValueError(f"startmodel = '{name}' holds pixels that are not finite")
-    return on_plane(pixels, PixelMap(csys, plane), plane.shape)
+    return on_plane(pixels * np.float32(factor), PixelMap(csys, plane), plane.shape)
 
 
 def _conversion(name, unit):
     """Say how an image in Jy/beam becomes one in Jy/pixel."""
     if unit != "Jy/beam":
         return ""
-    with opened("image", name) as ia:
+    with opened_image(name) as ia:
         beam, cell = ia.restoringbeam(), np.abs(ia.coordsys().increment()["numeric"][:2])
     if "major" not in beam:
         return "; divide it by the pixels in its beam, pi/(4 ln 2) times its axes over the pixel's, as immath does"

@@ -15,8 +15,8 @@ from casa_sara.casa.skyimage import SkyImage, read_header, read_sky_image
 
 __all__ = ["ImageSet", "check_same_data", "data_names", "read_frames", "read_image_set"]
 
-_SUFFIXES = ("", ".fits")
-_NAMES = (".model", ".model.fits", ".fits")
+_SUFFIXES = ("", ".fits", ".fits.gz")
+_NAMES = (".model", ".model.fits", ".model.fits.gz", ".fits", ".fits.gz")
 
 
 @dataclass(frozen=True)
@@ -121,10 +121,10 @@ def read_frames(names, plane):
     frames = []
     for given in names:
         path, root = _model_path(given, "frames")
-        image = read_sky_image(path, "frames", ("Jy/pixel",))
+        image = read_sky_image(path, "frames", ("Jy/pixel",)).upright()
         cell = np.degrees(image.plane.cell_rad) * 3600
-        if not image.is_aligned(plane):
-            raise ValueError(f"frames = '{given}' has another centre, or axes, than the first of models: should be "
+        if not image.plane.is_aligned(plane):
+            raise ValueError(f"frames = '{given}' has another centre than the first of models: should be "
                              "images of one field, with a pixel on one centre")
         if not np.isclose(*cell, rtol=1e-6):
             raise ValueError(f"frames = '{given}' has pixels of {cell[0]:.4g} x {cell[1]:.4g} arcsec: should be square")
@@ -146,7 +146,7 @@ def _model_path(given, parameter):
     """Return the path of the model image and the root of the names beside it."""
     given = given.rstrip("/")
     if os.path.exists(given):
-        for suffix in (".model.fits", ".model", ".fits"):
+        for suffix in (".model.fits.gz", ".model.fits", ".model", ".fits.gz", ".fits"):
             if given.endswith(suffix):
                 return given, given.removesuffix(suffix)
         if os.path.isfile(os.path.join(given, "table.dat")) or os.path.isfile(given):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casa_sara.casa.frames import Geometry, image_direction, separation
+from casa_sara.casa.frames import Geometry, image_direction, is_of_earth, on_sky, separation
 from casa_sara.casa.integrity import reading
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
@@ -257,7 +257,7 @@ def _check_directions(phasecenter, image, selected):
     """Raise when a field is elsewhere on the sky."""
     for ms in selected:
         for number, direction in ms.fields.items():
-            apart = np.degrees(separation(direction, image))
+            apart = np.degrees(separation(on_sky(direction, ms, ms.start_s), image))
             if apart > _WIDEST_BEAM:
                 raise ValueError(f"phasecenter = '{phasecenter}': field {number} of '{ms.name}' is {apart:.3g} degrees from "
                                  f"the centre of the image: should be within {_WIDEST_BEAM:g}; choose fields with field")
@@ -274,8 +274,10 @@ def _notes(selected, dropped):
     unusable = {reason: count for reason, count in dropped.items() if reason not in IN_FLAGS}
     if unusable:
         notes.append(f"unflagged samples cannot be used: {_counts(unusable)}")
-    centres = [(ms, field) for ms in selected for field in ms.fields]
-    spread = max(separation(ms.fields[field], centres[0][0].fields[centres[0][1]]) for ms, field in centres)
+    notes += [f"field {number} of '{ms.name}' is in {direction['refer']}: it is followed on the sky, integration by integration"
+              for ms in selected for number, direction in ms.fields.items() if is_of_earth(direction)]
+    centres = [on_sky(direction, ms, ms.start_s) for ms in selected for direction in ms.fields.values()]
+    spread = max(separation(centre, centres[0]) for centre in centres)
     if spread > _ONE_POINTING:
         notes.append(
             f"{len(centres)} fields, up to {np.degrees(spread) * 3600:.1f} arcsec apart, are imaged as one pointing: "

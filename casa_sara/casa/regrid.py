@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.casa.frames import direction_measure, turn_to_frame, unit_vectors
 from casa_sara.casa.imageplane import slabs
 
 __all__ = ["PixelMap", "corners", "interpolated", "on_plane"]
@@ -15,10 +16,12 @@ _SAME_SIZE = 1e-2  # pixels over a whole image, below which pixel sizes are the 
 class PixelMap:
     """Where the pixels of one image stand in the pixels of another.
 
+    Another frame of directions is reached by the rotation that is right at the image's reference, at the date of the other.
+
     Parameters
     ----------
     csys : casatools.coordsys
-        Of the one image; it is changed.
+        Of the one image.
     plane : object with `csys`, the record of a coordinate system
         The other image.
     """
@@ -30,25 +33,24 @@ class PixelMap:
         self._to.fromrecord(plane.csys)
         self._rest = np.asarray(csys.referencepixel()["numeric"])[2:]
         self._values = np.asarray(self._to.referencevalue()["numeric"])[2:]
-        self._turn_to(self._to.referencecode("direction")[0], plane.csys["obsdate"])
+        self._turn = self._to_frame(self._to.referencecode("direction")[0], plane.csys["obsdate"]["m0"]["value"])
 
-    def _turn_to(self, frame, date):
-        """Convert directions to this frame; coordsys does it without the date, which moves B1950 by 0.1 arcsec."""
-        import casatools
-
-        me, center = casatools.measures(), self._from.referencevalue("m")["measure"]["direction"]
-        me.doframe(date)
-        exact = me.measure(center, frame)
-        self._from.setconversiontype(direction=frame)
-        found = self._from.toworld(self._from.referencepixel()["numeric"])["numeric"][:2]
-        shift = np.array([exact["m0"]["value"], exact["m1"]["value"]]) - found
-        self._shift = np.array([np.remainder(shift[0] + np.pi, 2 * np.pi) - np.pi, shift[1]])[:, None]
+    def _to_frame(self, frame, days):
+        """Return the rotation to another frame of directions at a date (MJD), None where it is the same."""
+        own = self._from.referencecode("direction")[0]
+        if own == frame:
+            return None
+        longitude, latitude = self._from.referencevalue()["numeric"][:2]
+        return turn_to_frame(direction_measure(own, longitude, latitude), frame, float(days) * 86400)
 
     def __call__(self, x, y):
         """Return the pixel coordinates (2, N) of the pixel coordinates x, y (N,)."""
         pixels = np.vstack([x, y, *(np.full(x.size, rest) for rest in self._rest)])
-        sky = self._from.toworldmany(pixels)["numeric"][:2] + self._shift
-        world = np.vstack([sky, *(np.full(x.size, value) for value in self._values)])
+        sky = self._from.toworldmany(pixels)["numeric"][:2]
+        if self._turn is not None:
+            east, north, up = self._turn @ unit_vectors(*sky)
+            sky = np.arctan2(north, east), np.arctan2(up, np.hypot(east, north))
+        world = np.vstack([*sky, *(np.full(x.size, value) for value in self._values)])
         return self._to.topixelmany(world)["numeric"][:2]
 
 

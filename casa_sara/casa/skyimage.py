@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import os
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from casa_sara.casa.fitsfiles import opened_image
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.regrid import PixelMap, corners, interpolated, on_plane
-from casa_sara.casa.tools import opened
+from casa_sara.casa.units import brightness_unit
 
-__all__ = ["SkyImage", "SkyPlane", "beam_numbers", "read_header", "read_sky_image"]
+__all__ = ["SkyImage", "SkyPlane", "beam_numbers", "check_sky_axes", "read_header", "read_sky_image", "unit_of"]
 
-_SPELLINGS = {"jy/pixel": "Jy/pixel", "jy/pix": "Jy/pixel", "jy/beam": "Jy/beam", "jy/bm": "Jy/beam", "": ""}
 _PARAMETER = re.compile(r"(\w+)\s*=\s*(.*)")
+_SAME_PLACE = 1e-6  # pixels
+_BY_STANDARD = 999.0  # of LONPOLE and LATPOLE: CASA is to follow the FITS standard
 _LARGEST_TURN = 0.05  # pixels by which a corner may be off where a grid is of the same centre and axes
 
 
@@ -48,13 +50,67 @@ class SkyPlane:
     @property
     def cell_rad(self) -> tuple[float, float]:
         """Pixel size along x and y, both positive."""
-        increments = self.coordinates().increment()["numeric"][:2]
-        return tuple(float(abs(step)) for step in increments)
+        return tuple(np.hypot(*self._steps).tolist())
+
+    @property
+    def _steps(self):
+        """Steps to the east and to the north (rows) of one pixel along x and along y (columns), rad, before projection."""
+        sky = self.csys["direction0"]
+        return np.asarray(sky["cdelt"])[:, None] * np.asarray(sky["pc"]).T  # CASA's record has PC transposed
 
     @property
     def centre(self) -> tuple[float, float]:
-        """Longitude and latitude in radians of pixel (nx//2, ny//2)."""
-        return self.direction(*(n // 2 for n in self.shape))
+        """Longitude and latitude in radians of pixel (nx//2, ny//2); at a pole the longitude that its axes go by."""
+        sky, middle = self.csys["direction0"], [n // 2 for n in self.shape]
+        if np.abs(sky["crpix"] - middle).max() < _SAME_PLACE:
+            return tuple(sky["crval"].tolist())
+        return self.direction(*middle)
+
+    def is_aligned(self, plane: SkyPlane) -> bool:
+        """Tell whether this plane has the centre, axes and projection of the other, whatever its pixels."""
+        found = PixelMap(self.coordinates(), plane)(*corners(self.shape))
+        ratio = [[a / b] for a, b in zip(self.cell_rad, plane.cell_rad)]
+        offsets = corners(self.shape) - [[n // 2] for n in self.shape]
+        expected = offsets * ratio + [[n // 2] for n in plane.shape]
+        return bool(np.abs(found - expected).max() < _LARGEST_TURN * max(1, np.min(ratio)))
+
+    def upright(self) -> SkyPlane:
+        """Return the plane that shows all of this one with x to the west and y to the north, in SIN projection.
+
+        It is this very plane where that is so already. Of one that is mirrored or turned by right angles, each pixel is a
+        pixel of the new one.
+        """
+        # which axis runs along the new x, which along y, and whether backwards
+        steps = self._steps * [[-1], [1]]
+        along = [1, 0] if np.abs(steps[[0, 1], [1, 0]]).sum() > np.abs(steps[[0, 1], [0, 1]]).sum() else [0, 1]
+        middle = [0, 0]
+        for new, old in enumerate(along):
+            middle[old] = self.shape[old] // 2 if steps[new, old] > 0 else (self.shape[old] - 1) // 2
+        centre = self.centre if middle == [n // 2 for n in self.shape] else self.direction(*middle)
+        cell = [self.cell_rad[old] for old in along]
+        if self.is_aligned(self._laid_out(centre, cell, self.shape)):
+            return self
+        # as many pixels as hold the corners
+        place = PixelMap(self.coordinates(), self._laid_out(centre, cell, (1, 1)))(*corners(self.shape))
+        before, after = (np.ceil(side.max(axis=1) - _LARGEST_TURN).astype(int) for side in (-place, place))
+        return self._laid_out(centre, cell, tuple(int(max(2 * b, 2 * a + 1, 1)) for b, a in zip(before, after)))
+
+    def _laid_out(self, centre, cell, shape):
+        """Return a plane with pixel (nx//2, ny//2) at this centre, x to the west, y to the north and square corners."""
+        import casatools
+
+        axes = {"projection": "SIN", "projection_parameters": np.zeros(2), "crval": np.array(centre, float),
+                "crpix": np.array([n // 2 for n in shape], float), "cdelt": np.array([-cell[0], cell[1]]), "pc": np.eye(2),
+                "longpole": _BY_STANDARD, "latpole": _BY_STANDARD}
+        csys = casatools.coordsys()
+        csys.fromrecord(self.csys | {"direction0": self.csys["direction0"] | axes})
+        return SkyPlane(csys.torecord(), shape)
+
+    def trimmed(self, edges) -> SkyPlane:
+        """Return the plane without so many pixels at either end of x and of y."""
+        sky = self.csys["direction0"]
+        csys = self.csys | {"direction0": sky | {"crpix": np.asarray(sky["crpix"]) - edges}}
+        return SkyPlane(csys, tuple(n - 2 * edge for n, edge in zip(self.shape, edges)))
 
 
 @dataclass(frozen=True)
@@ -103,13 +159,10 @@ class SkyImage:
         far = [(x < -0.5).all(), (y < -0.5).all(), (x > there.shape[0] - 0.5).all(), (y > there.shape[1] - 0.5).all()]
         return not any(far)
 
-    def is_aligned(self, plane: SkyPlane) -> bool:
-        """Tell whether this image has the centre, axes and projection of the other, whatever its pixels."""
-        found = PixelMap(self.plane.coordinates(), plane)(*corners(self.plane.shape))
-        ratio = [[a / b] for a, b in zip(self.plane.cell_rad, plane.cell_rad)]
-        offsets = corners(self.plane.shape) - [[n // 2] for n in self.plane.shape]
-        expected = offsets * ratio + [[n // 2] for n in plane.shape]
-        return bool(np.abs(found - expected).max() < _LARGEST_TURN * max(1, np.min(ratio)))
+    def upright(self) -> SkyImage:
+        """Return this Jy/pixel image with x to the west and y to the north (see :meth:`SkyPlane.upright`)."""
+        plane = self.plane.upright()
+        return self if plane is self.plane else replace(self, pixels=self.flux_on(plane).astype(np.float32), plane=plane)
 
 
 def read_sky_image(name, parameter, units):
@@ -122,7 +175,7 @@ def read_sky_image(name, parameter, units):
     parameter : str
         Task parameter that named it, for messages.
     units : sequence of str or None
-        What is right here: out of 'Jy/pixel', 'Jy/beam', ''; None takes any.
+        What is right here: out of 'Jy/pixel', 'Jy/beam', ''; units that can be converted to these are. None takes any.
 
     Returns
     -------
@@ -136,19 +189,20 @@ def read_sky_image(name, parameter, units):
     if not os.path.exists(name):
         raise FileNotFoundError(f"{parameter} = '{name}' does not exist: it takes a CASA image or a FITS file")
     try:
-        with opened("image", name) as ia:
-            shape, unit, beam = tuple(int(n) for n in ia.shape()), ia.brightnessunit(), ia.restoringbeam()
+        with opened_image(name) as ia:
+            shape, given, beam = tuple(int(n) for n in ia.shape()), ia.brightnessunit(), ia.restoringbeam()
             csys, history = ia.coordsys(), ia.history(list=False)
-            _check_axes(name, parameter, shape, csys)
-            csys.setunits(["rad", "rad", *csys.units()[2:]])
+            check_sky_axes(name, parameter, csys)
+            _check_plane(name, parameter, shape, csys)
             pixels = read_pixels(ia)
     except RuntimeError as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
-    unit = _SPELLINGS.get(unit.lower(), unit)
+    unit, factor = unit_of(given, csys)
     if units is not None and unit not in units:
         right = " or ".join(f"'{word}'" for word in units if word)
         hint = "; the model is the image before it is convolved with the beam" if unit == "Jy/beam" else ""
-        raise ValueError(f"{parameter} = '{name}' is in '{unit}': should be in {right}{hint}")
+        raise ValueError(f"{parameter} = '{name}' is in '{given}': should be in {right}{hint}")
+    pixels *= np.float32(factor)
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
@@ -157,16 +211,36 @@ def read_sky_image(name, parameter, units):
 
 def read_header(name):
     """Return the beam of an image, None where it has none, and the task parameters in its history."""
-    with opened("image", name) as ia:
+    with opened_image(name) as ia:
         return beam_numbers(ia.restoringbeam()), _parameters(ia.history(list=False))
 
 
-def _check_axes(name, parameter, shape, csys):
-    """Raise unless the axes are two of the sky and at most one plane of others."""
-    axes = csys.axiscoordinatetypes()
-    if len(shape) < 2 or list(axes[:2]) != ["Direction", "Direction"]:
+def check_sky_axes(name, parameter, csys):
+    """Raise unless the first two axes are of the sky; bring these to radians."""
+    if list(csys.axiscoordinatetypes()[:2]) != ["Direction", "Direction"]:
         raise ValueError(f"{parameter} = '{name}' has the axes {', '.join(csys.names())}: should begin with right "
                          "ascension and declination")
+    csys.setunits(["rad", "rad", *csys.units()[2:]])
+
+
+def unit_of(text, csys):
+    """Return unit and factor of :func:`brightness_unit`; Jy/sr is brought to Jy/pixel by the solid angle of a pixel.
+
+    Parameters
+    ----------
+    text : str
+    csys : casatools.coordsys
+        Directions in radians.
+    """
+    unit, factor = brightness_unit(text)
+    if unit != "Jy/sr":
+        return unit, factor
+    sky = csys.torecord()["direction0"]
+    return "Jy/pixel", factor * float(abs(np.prod(sky["cdelt"]) * np.linalg.det(sky["pc"])))
+
+
+def _check_plane(name, parameter, shape, csys):
+    """Raise unless there is one plane, of Stokes I."""
     if int(np.prod(shape[2:])) != 1:
         raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one channel")
     stokes = csys.stokes() if csys.findcoordinate("stokes")["return"] else ["I"]

@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from casa_sara.casa.fitsfiles import opened_image
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.quantities import hertz
 from casa_sara.casa.skyimage import SkyPlane, read_sky_image
-from casa_sara.casa.tools import opened
 from casa_sara.options import LARGEST_INDEX, Spectrum
 
 __all__ = ["check_spectral_index", "spectral_band", "with_spectrum"]
@@ -85,7 +85,7 @@ def _index_image(name, plane):
     Masked pixels, and those beyond the image, have the median of the others.
     """
     image = read_sky_image(name, "spectralindex", ("",))
-    with opened("image", name) as ia:
+    with opened_image(name) as ia:
         good = read_pixels(ia, getmask=True)
     if not good.any() or not image.overlaps(plane):
         raise ValueError(f"spectralindex = '{name}' has no good pixel in the image: should show the same sky")

@@ -6,8 +6,10 @@ import os
 
 import numpy as np
 
+from casa_sara.casa.fitsfiles import is_fits, opened_image
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.images import write_image
+from casa_sara.casa.skyimage import check_sky_axes
 from casa_sara.casa.tools import opened, scratch_folder
 
 __all__ = ["read_support"]
@@ -48,8 +50,8 @@ def read_support(grid, plane):
         if not found.any():
             limits = f", pbmask = {grid.pbmask:g}" if grid.pbmask else ""
             raise ValueError(f"mask = '{entry}'{limits} selects no pixel: should be a CRTF region as 'circle[[40pix,40pix],"
-                             "10pix]', a file of them that begins with #CRTF, or the name of an image of ones and zeros, with "
-                             f"something in it inside this image of {list(plane.shape)} pixels; '' is no mask")
+                             "10pix]', a file of them that begins with #CRTF, or an image of ones and zeros, CASA's or FITS, "
+                             f"with something in it inside this image of {list(plane.shape)} pixels; '' is no mask")
         support |= found
     return support
 
@@ -62,8 +64,8 @@ def _mask_of(entry, plane):
     with scratch_folder(plane.shape) as folder:
         root = os.path.join(folder, "support")
         _write_what_tclean_needs(root, plane)
-        wanted = os.path.abspath(entry) if os.path.exists(entry) else entry
         try:
+            wanted = _as_tclean_reads(entry, root + ".given")
             deconvolver.setupdeconvolution({
                 "imagename": root, "deconvolver": "hogbom", "specmode": "mfs", "startmodel": "", "restoringbeam": [],
                 "usemask": "user", "mask": wanted})
@@ -76,6 +78,27 @@ def _mask_of(entry, plane):
             deconvolver.done()
         with opened("image", root + ".mask") as ia:
             return read_pixels(ia) > 0
+
+
+def _as_tclean_reads(entry, copy):
+    """Return the name of a mask as tclean takes it.
+
+    Of an image that is FITS, or lacks axes, that is a copy, of which Stokes and frequency say nothing: tclean would
+    convert the latter, and fail where the telescope is not known.
+    """
+    if not is_fits(entry) and not os.path.isfile(os.path.join(entry, "table.dat")):
+        return os.path.abspath(entry) if os.path.exists(entry) else entry  # a region, or a file of them
+    with opened_image(entry) as ia:
+        csys, shape = ia.coordsys(), ia.shape()
+        check_sky_axes(entry, "mask", csys)
+        if not is_fits(entry) and all(csys.findcoordinate(kind)["return"] for kind in ("stokes", "spectral")):
+            return os.path.abspath(entry)
+        if shape[2:].prod() != 1:
+            raise ValueError(f"mask = '{entry}' has the shape {shape.tolist()}: should be one Stokes, one channel")
+        plane = ia.subimage(dropdeg=True)
+        plane.adddegaxes(copy, spectral=True, stokes="I").done()
+        plane.done()
+    return copy
 
 
 def _write_what_tclean_needs(root, plane):

@@ -49,9 +49,11 @@ class _saracompare:
     Parameters
     ----------
     models : str or list of str, required
-        Each is the common root of an imager's products, a model image, or a FITS file, in
-        Jy/pixel. Beside root.model or root.model.fits, the residual, image, PSF and the record of
-        tsara (root.sara.json) are found by their names. The first sets the pixels.
+        Each is the common root of an imager's products, a model image, or a FITS file (.fits.gz
+        too), in Jy/pixel or a unit that can be converted to it, as mJy/pixel or MJy/sr. Beside
+        root.model or root.model.fits, the residual, image, PSF and the record of tsara
+        (root.sara.json) are found by their names. The first sets the pixels: of one whose axes are
+        mirrored or turned, pixels of this size with right ascension to the left and north up.
         Examples: models=['run/sara', 'run/clean']
                   models=['sara.model', 'other.fits']
 

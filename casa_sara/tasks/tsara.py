@@ -221,7 +221,8 @@ class _tsara:
         Only SIN: the projection in which an interferometer sees the sky.
 
     startmodel : str, default ''
-        An image in Jy/pixel to start from, on any grid: it is regridded with its flux kept. It
+        An image to start from, CASA's or a FITS file (.fits.gz too), on any grid: it is regridded with
+        its flux kept. It is in Jy/pixel, or in a unit that can be converted to it as mJy/pixel. It
         changes how long the solver takes, not what it converges to, where the data decide. On scales
         that no baseline sees the solution keeps some of it, from a quarter to all in trials: it helps,
         but does not assure the extended flux of a single dish. For that, feather .image afterwards.
@@ -407,7 +408,7 @@ class _tsara:
     mask : str or list of str, default ''
         Opened by usemask = 'user'.
         A region in CASA's text format (CRTF), a file of them, or an image of ones and zeros on any
-        grid; or a list of these, whose union counts. '' is no mask. An entry that selects nothing of
+        grid, CASA's or a FITS file; or a list of these, whose union counts. '' is no mask. An entry that selects nothing of
         the image is refused.
         Examples: mask='circle[[40pix,40pix],10pix]'
                   mask='old.mask'
