@@ -43,7 +43,7 @@ class Visibilities:
         Inverse variance of the real part, and of the imaginary part, in 1/Jy²:
         4 / (1/w_RR + 1/w_LL), exact when WEIGHT = 1/SIGMA².
     imaging_weight : float32 (M,)
-        tclean's natural gridding weight, (w_RR + w_LL) / 2.
+        tclean's natural gridding weight, (w_RR + w_LL) / 2 of RR (first) to LL (last).
     uvw : float64 (3, M)
         Baselines in wavelengths at the LSRK frequency of the integration.
     row : int32 (M,)

@@ -37,10 +37,13 @@ _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw"
 def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, crew=ALONE):
     """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
 
-    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one hand there is, and as tclean (of circular, or of linear feeds)
+    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel hand there is, and as tclean (of circular, or of linear
+    feeds)
 
         V_Q = (V_RL + V_LR)/2,  (V_XX − V_YY)/2;    V_U = (V_RL − V_LR)/2i,  (V_XY + V_YX)/2;
-        V_V = (V_RR − V_LL)/2,  (V_XY − V_YX)/2i.
+        V_V = (V_RR − V_LL)/2,  (V_XY − V_YX)/2i;
+
+    where the Stokes parameter itself is stored, it is taken as it stands.
 
     A sample is left out
     when any of its correlations is flagged (cross-hands too, as in tclean), when its row is
@@ -51,7 +54,8 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     The inverse variance of Re V_I and of Im V_I follows from those of the hands:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
     WEIGHT = 1/SIGMA² with SIGMA the scatter of the real and of the imaginary part. The same holds for Q, U and V of
-    theirs. tclean's imaging weight is the mean of the parallel hands, whatever the Stokes parameter.
+    theirs. tclean's imaging weight is the mean of those of the first and the last correlation, in the order of the
+    MeasurementSet and whatever the Stokes parameter: of RR, RL, LR, LL the mean of the parallel hands.
 
     The MeasurementSets are opened read-only and stay as they are, byte by byte.
 
@@ -140,14 +144,14 @@ def _pieces(group):
 
 @dataclass
 class _Chunk:
-    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `parallel` the parallel hands' weights."""
+    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `weighing` tclean's two weights."""
 
     rows: np.ndarray
     columns: dict[str, np.ndarray]
     uvw_m: np.ndarray
     vis: list[np.ndarray]
     weight: list[np.ndarray]
-    parallel: list[np.ndarray]
+    weighing: list[np.ndarray]
     flag: np.ndarray
     flag_row: np.ndarray
 
@@ -184,7 +188,7 @@ def _read(part, rows, column, weights, group):
         uvw_m=part.getcol("UVW"),
         vis=[vis[hand] for hand in group.hands],
         weight=of_hands,
-        parallel=of_hands if group.parallel == group.hands else [weight[hand] for hand in group.parallel],
+        weighing=of_hands if group.weighing == group.hands else [weight[hand] for hand in group.weighing],
         flag=np.any(planes("FLAG"), axis=0),
         flag_row=part.getcol("FLAG_ROW"),
     )
@@ -226,7 +230,7 @@ class _SampleTable:
         new = {
             "vis": vis,
             "weight": hands**2 / sum(1 / hand for hand in weight),
-            "imaging_weight": sum(hand[ok] for hand in chunk.parallel) / len(chunk.parallel),
+            "imaging_weight": sum(hand[ok] for hand in chunk.weighing) / len(chunk.weighing),
             "uvw": np.array([axis[ok] for axis in uvw]),
             "row": np.repeat(number, ok.sum(axis=1)),
             "chan": channel[ok],

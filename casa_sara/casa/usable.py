@@ -37,7 +37,7 @@ class Usability:
         noise); baselines of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
         """
         ok = np.ones(chunk.flag.shape, dtype=bool)
-        weights = chunk.weight if chunk.parallel is chunk.weight else [*chunk.weight, *chunk.parallel]
+        weights = chunk.weight if chunk.weighing is chunk.weight else [*chunk.weight, *chunk.weighing]
         self._leave_out(ok, "autocorrelation", (chunk.columns["antenna1"] == chunk.columns["antenna2"])[:, None])
         self._leave_out(ok, "flagged row", chunk.flag_row[:, None])
         self._leave_out(ok, "flagged", chunk.flag)
