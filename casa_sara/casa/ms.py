@@ -8,9 +8,9 @@ import numpy as np
 
 from casa_sara.casa.frames import Geometry, image_direction, separation
 from casa_sara.casa.integrity import reading
-from casa_sara.casa.selection import select_data
+from casa_sara.casa.selection import UNPOLARISED, select_data
 from casa_sara.casa.tools import opened
-from casa_sara.casa.usable import IN_FLAGS, SMALLEST, Usability
+from casa_sara.casa.usable import IN_FLAGS, LIGHTEST, SMALLEST, Usability
 from casa_sara.sharing import ALONE
 from casa_sara.visibilities import RowTable, Visibilities
 
@@ -45,11 +45,11 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
 
     where the Stokes parameter itself is stored, it is taken as it stands.
 
-    A sample is left out
-    when any of its correlations is flagged (cross-hands too, as in tclean), when its row is
-    flagged or an autocorrelation, and when data, weights or uvw cannot be used; what was left
-    out is counted by the first reason that applies. Weights are WEIGHT_SPECTRUM where it is
-    filled, else WEIGHT, whatever the data column (as in tclean).
+    A sample is left out when any of its correlations is flagged (cross-hands too, as in tclean), when its row is flagged or
+    an autocorrelation, and when data, weights or uvw cannot be used; what was left out is counted by the first reason that
+    applies. Weights are WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the data column (as in tclean). Where one
+    parallel hand has no weight (0, negative or NaN), Stokes I is the other one, with its weight; tclean takes the mean of
+    both there.
 
     The inverse variance of Re V_I and of Im V_I follows from those of the hands:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
@@ -100,7 +100,7 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
                          f"{', '.join(selection.vis)} that can be used are zero: it may never have been filled")
     return table.visibilities(
         ms_names=tuple(selection.vis),
-        notes=notes + unused + _notes(selected, dropped),
+        notes=notes + unused + _notes(selected, table.usable),
         phase_center=image,
         freq_range_hz=(low, high),
         spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
@@ -144,7 +144,10 @@ def _pieces(group):
 
 @dataclass
 class _Chunk:
-    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `weighing` tclean's two weights."""
+    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `weighing` tclean's two weights.
+
+    `either` is that of the RowGroup.
+    """
 
     rows: np.ndarray
     columns: dict[str, np.ndarray]
@@ -154,6 +157,7 @@ class _Chunk:
     weighing: list[np.ndarray]
     flag: np.ndarray
     flag_row: np.ndarray
+    either: bool
 
 
 def _chunks(tb, ms, group, pieces):
@@ -191,6 +195,7 @@ def _read(part, rows, column, weights, group):
         weighing=of_hands if group.weighing == group.hands else [weight[hand] for hand in group.weighing],
         flag=np.any(planes("FLAG"), axis=0),
         flag_row=part.getcol("FLAG_ROW"),
+        either=group.either,
     )
 
 
@@ -214,23 +219,22 @@ class _SampleTable:
 
     def add(self, chunk, ms, group, geometry):
         """Whiten, turn and append the usable samples of a chunk."""
-        ok = self.usable(chunk)
+        ok, weighted = self.usable(chunk)
         columns = chunk.columns
         kept = ok.any(axis=1)
         uvw, shift = geometry.wavelengths(group, columns["field"], columns["time"], np.where(kept, chunk.uvw_m, 0.0))
-        hands = len(chunk.vis)
-        vis = chunk.vis[0][ok]
-        if hands == 2:
-            vis = (vis + group.sign * chunk.vis[1][ok]) / group.divisor
+        vis, weight, alone = _formed(chunk, group, ok, weighted)
+        for hand, here in zip(group.hands, alone):
+            self.usable.count_alone(group.correlations[hand], here)
         if shift is not None:
             vis *= np.exp(-2j * np.pi * shift[ok])
-        weight = [hand[ok] for hand in chunk.weight]
+        hands = len(chunk.vis)
         number = self._rows_so_far + np.cumsum(kept) - 1
         channel = np.broadcast_to(group.channels, ok.shape)
         new = {
             "vis": vis,
-            "weight": hands**2 / sum(1 / hand for hand in weight),
-            "imaging_weight": sum(hand[ok] for hand in chunk.weighing) / len(chunk.weighing),
+            "weight": weight,
+            "imaging_weight": _imaging_weight([hand[ok] for hand in chunk.weighing], alone, weight / hands),
             "uvw": np.array([axis[ok] for axis in uvw]),
             "row": np.repeat(number, ok.sum(axis=1)),
             "chan": channel[ok],
@@ -249,7 +253,33 @@ class _SampleTable:
     def visibilities(self, **about):
         """Join the chunks, one column after the other to keep the peak of memory low."""
         samples, rows = ({name: _join(lists, name) for name in tuple(lists)} for lists in (self._samples, self._rows))
-        return Visibilities(**samples, rows=RowTable(**rows), dropped=self.usable.dropped, **about)
+        return Visibilities(**samples, rows=RowTable(**rows), dropped=self.usable.dropped, alone=self.usable.alone, **about)
+
+
+def _formed(chunk, group, ok, weighted):
+    """Return the Stokes parameter of the samples that are `ok` and its inverse variance, and where it is of one hand alone.
+
+    Returns
+    -------
+    vis, weight : (M,)
+    alone : list of bool (M,)
+        For each hand, where it alone has a weight.
+    """
+    vis, weight = ([hand[ok] for hand in hands] for hands in (chunk.vis, chunk.weight))
+    if len(vis) == 1:
+        return vis[0], weight[0], []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        formed, total = (vis[0] + group.sign * vis[1]) / group.divisor, 4 / (1 / weight[0] + 1 / weight[1])
+    alone = [~there[ok] for there in reversed(weighted)]
+    for here, one, its_weight in zip(alone, vis, weight):
+        formed[here], total[here] = one[here], its_weight[here]
+    return formed, total, alone
+
+
+def _imaging_weight(weighing, alone, otherwise):
+    """Return the mean of tclean's two weights, and what the noise says, `otherwise`, where one of them cannot be used."""
+    unusable = np.any([*alone, *(~(weight >= LIGHTEST) for weight in weighing)], axis=0)
+    return np.where(unusable, otherwise, sum(weighing) / len(weighing))
 
 
 def _join(lists, name):
@@ -272,10 +302,11 @@ def _counts(dropped):
     return ", ".join(f"{count} samples left out as {reason}" for reason, count in dropped.items())
 
 
-def _notes(selected, dropped):
+def _notes(selected, usable):
     """Return the warnings that the data themselves give rise to."""
-    notes = []
-    unusable = {reason: count for reason, count in dropped.items() if reason not in IN_FLAGS}
+    notes = [f"{count} samples are of {name} alone, because the other hand has no weight: {UNPOLARISED}"
+             for name, count in usable.alone.items()]
+    unusable = {reason: count for reason, count in usable.dropped.items() if reason not in IN_FLAGS}
     if unusable:
         notes.append(f"unflagged samples cannot be used: {_counts(unusable)}")
     centres = [(ms, field) for ms in selected for field in ms.fields]

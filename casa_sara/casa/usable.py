@@ -23,40 +23,61 @@ class Usability:
         Reason → number of samples.
     strongest : float
         Largest √w·|V| of one correlation among the samples that can be used.
+    alone : dict
+        Correlation → number of samples that are of it alone, because the other one has no weight.
     """
 
     def __init__(self):
         self.dropped = {}
+        self.alone = {}
         self.strongest = 0.0
 
     def __call__(self, chunk):
-        """Return the bool (R, C) of samples to keep of R rows and C channels, and count the others.
+        """Return which samples to keep of R rows and C channels, bool (R, C), and count the others.
 
         Beside flags and numbers that are none, these are left out: weights beyond single precision or 1e6 times the
         median; data beyond single precision, or 1e9 times their noise and 1e6 times the median (in units of the
         noise); baselines of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
+
+        A correlation has no weight where its weight is not a number, 0, negative or below 1e-30 /Jy². What it holds there does
+        not matter where the other is enough, as for Stokes I.
+
+        Returns
+        -------
+        ok : bool (R, C)
+        weighted : list of bool (R, C)
+            For each hand, where it has a weight.
         """
         ok = np.ones(chunk.flag.shape, dtype=bool)
+        weighted = [hand >= LIGHTEST for hand in chunk.weight]
+        formed = np.any(weighted, axis=0) if chunk.either else np.all(weighted, axis=0)
         weights = chunk.weight if chunk.weighing is chunk.weight else [*chunk.weight, *chunk.weighing]
+        finite = np.all([np.isfinite(vis) | ~there for vis, there in zip(chunk.vis, weighted)], axis=0)
         self._leave_out(ok, "autocorrelation", (chunk.columns["antenna1"] == chunk.columns["antenna2"])[:, None])
         self._leave_out(ok, "flagged row", chunk.flag_row[:, None])
         self._leave_out(ok, "flagged", chunk.flag)
-        self._leave_out(ok, "non-finite data", ~np.all([np.isfinite(hand) for hand in chunk.vis], axis=0))
-        self._leave_out(ok, "non-finite weight", ~np.all([np.isfinite(hand) for hand in weights], axis=0))
-        self._leave_out(ok, "non-positive weight", np.any([hand <= 0 for hand in weights], axis=0))
+        self._leave_out(ok, "non-finite data", ~finite)
+        self._leave_out(ok, "non-finite weight", np.any([np.isinf(hand) for hand in weights], axis=0))
+        self._leave_out(ok, "non-finite weight", ~formed & np.any([np.isnan(hand) for hand in chunk.weight], axis=0))
+        self._leave_out(ok, "non-positive weight", ~formed & np.any([hand <= 0 for hand in chunk.weight], axis=0))
         self._leave_out(ok, "non-finite uvw", ~np.isfinite(chunk.uvw_m).all(axis=0)[:, None])
         self._leave_out(ok, "impossible uvw", _is_impossible(chunk.uvw_m)[:, None])
-        self._leave_out(ok, "impossible weight", _is_wild_weight(weights, ok))
-        strength = [_strength(vis, weight, ok) for vis, weight in zip(chunk.vis, chunk.weight)]
+        self._leave_out(ok, "impossible weight", ~formed | _is_wild_weight(weights, ok))
+        strength = [_strength(vis, weight, ok & there) for vis, weight, there in zip(chunk.vis, chunk.weight, weighted)]
         self._leave_out(ok, "impossible data", _is_wild_data(strength, ok))
         self.strongest = max([self.strongest, *(hand.max(where=ok, initial=0.0) for hand in strength)])
-        return ok
+        return ok, weighted
 
     def merge(self, comm):
-        """Add up what all ranks of a communicator have left out."""
-        every = comm.gather(self.dropped)
-        self.dropped = {reason: sum(one.get(reason, 0) for one in every) for one in every for reason in one}
+        """Add up the counts of all ranks of a communicator."""
+        self.dropped, self.alone = map(_total, zip(*comm.gather((self.dropped, self.alone))))
         self.strongest = comm.largest(self.strongest)
+
+    def count_alone(self, name, here):
+        """Count the samples of one correlation alone."""
+        count = int(np.count_nonzero(here))
+        if count:
+            self.alone[name] = self.alone.get(name, 0) + count
 
     def _leave_out(self, ok, reason, bad):
         """Take `bad` samples out of `ok` and count them."""
@@ -64,6 +85,11 @@ class Usability:
         if count:
             self.dropped[reason] = self.dropped.get(reason, 0) + count
             ok &= ~bad
+
+
+def _total(counts):
+    """Add up dicts of numbers."""
+    return {name: sum(one.get(name, 0) for one in counts) for one in counts for name in one}
 
 
 def _is_impossible(uvw_m):
@@ -76,9 +102,10 @@ def _is_wild_weight(weights, ok):
     """Whether a weight is beyond single precision, or far above the others; bool (R, C)."""
     bad = np.zeros(ok.shape, bool)
     for hand in weights:
-        bad |= (hand < LIGHTEST) | (hand > HEAVIEST)
-        if hand.max(where=ok & ~bad, initial=0.0) > ABOVE_OTHERS * hand.min(where=ok & ~bad, initial=np.inf):
-            bad |= hand > ABOVE_OTHERS * np.median(hand[ok & ~bad])
+        bad |= hand > HEAVIEST
+        there = ok & ~bad & (hand >= LIGHTEST)
+        if hand.max(where=there, initial=0.0) > ABOVE_OTHERS * hand.min(where=there, initial=np.inf):
+            bad |= hand > ABOVE_OTHERS * np.median(hand[there])
     return bad
 
 
