@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,39 +87,41 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     image = image_direction(phasecenter, selected)
     _check_directions(phasecenter, image, selected)
     comm = crew.comm
-    table, sizes, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, crew), frequencies)
-    sizes, ranges = np.sum(comm.gather(sizes), axis=0), np.concatenate(comm.gather(ranges))
-    unused = [f"no sample of '{ms.name}' can be used: nothing of it is imaged" for ms, size in zip(selected, sizes) if not size]
-    low, high = float(ranges[:, 0].min()), float(ranges[:, 1].max())
-    table.usable.merge(comm)
-    dropped = table.usable.dropped
-    if sizes.sum() == 0:
-        raise ValueError(f"vis: no sample of {', '.join(selection.vis)} can be used: {_counts(dropped)}")
-    if table.usable.strongest < SMALLEST:
-        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {sizes.sum()} samples of "
+    table, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, crew), frequencies)
+    ranges = np.concatenate(comm.gather(ranges))
+    data = table.usable_visibilities(comm)
+    usable, size = table.usable, comm.total(data.size)
+    rows_of = comm.sum(np.bincount(data.rows.ms, minlength=len(selection.vis)))
+    unused = [f"no sample of '{ms.name}' can be used: nothing of it is imaged" for ms in selected if not rows_of[ms.number]]
+    if size == 0:
+        raise ValueError(f"vis: no sample of {', '.join(selection.vis)} can be used: {_counts(usable.dropped)}")
+    if usable.strongest < SMALLEST:
+        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {size} samples of "
                          f"{', '.join(selection.vis)} that can be used are zero: it may never have been filled")
-    return table.visibilities(
+    return replace(
+        data,
         ms_names=tuple(selection.vis),
-        notes=notes + unused + _notes(selected, table.usable),
+        dropped=usable.dropped,
+        alone=usable.alone,
+        notes=notes + unused + _notes(selected, usable),
         phase_center=image,
-        freq_range_hz=(low, high),
+        freq_range_hz=(float(ranges[:, 0].min()), float(ranges[:, 1].max())),
         spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
         observatory=selected[0].observatory,
     )
 
 
 def _read_all(selected, image, pieces, frequencies):
-    """Return the table of the samples in these pieces, and the number of samples and the frequencies of each MeasurementSet."""
-    table, sizes, ranges = _SampleTable(frequencies), [], []
+    """Return the table of the samples in these pieces, and the frequencies of each MeasurementSet."""
+    table, ranges = _SampleTable(frequencies), []
     for ms in selected:
-        geometry, before = Geometry(ms, image), table.size
+        geometry = Geometry(ms, image)
         with reading(ms.name), opened("table", ms.name) as tb:
             for number, group in enumerate(ms.groups):
                 for chunk in _chunks(tb, ms, group, pieces[ms.number, number]):
                     table.add(chunk, ms, group, geometry)
-        sizes.append(table.size - before)
         ranges.append(tuple(geometry.freq_range_hz))
-    return table, sizes, ranges
+    return table, ranges
 
 
 def _own_pieces(selected, crew):
@@ -211,8 +213,8 @@ class _SampleTable:
 
     def __init__(self, frequencies):
         self.usable = Usability()
-        self.size = 0
-        self._rows_so_far = 0
+        self._size = self._rows_so_far = 0
+        self._alone = []
         self._samples = {name: [np.empty((3, 0) if name == "uvw" else 0, dtype)] for name, dtype in _SAMPLE_DTYPES.items()
                          if frequencies or name != "freq_hz"}
         self._rows = {name: [np.empty(0, _ROW_DTYPES.get(name, np.int32))] for name in RowTable.__dataclass_fields__}
@@ -224,8 +226,8 @@ class _SampleTable:
         kept = ok.any(axis=1)
         uvw, shift = geometry.wavelengths(group, columns["field"], columns["time"], np.where(kept, chunk.uvw_m, 0.0))
         vis, weight, alone = _formed(chunk, group, ok, weighted)
-        for hand, here in zip(group.hands, alone):
-            self.usable.count_alone(group.correlations[hand], here)
+        self._alone += [(group.correlations[hand], self._size + np.flatnonzero(here))
+                        for hand, here in zip(group.hands, alone) if here.any()]
         if shift is not None:
             vis *= np.exp(-2j * np.pi * shift[ok])
         hands = len(chunk.vis)
@@ -248,12 +250,17 @@ class _SampleTable:
         for name, values in (columns | of_group | {"row": chunk.rows}).items():
             self._rows[name].append(values[kept].astype(_ROW_DTYPES.get(name, np.int32)))
         self._rows_so_far += int(kept.sum())
-        self.size += vis.size
+        self._size += vis.size
 
-    def visibilities(self, **about):
-        """Join the chunks, one column after the other to keep the peak of memory low."""
+    def usable_visibilities(self, comm):
+        """Join the chunks, leave out what is out of proportion to all others, and add up the counts of all ranks."""
+        # one column after the other, to keep the peak of memory low
         samples, rows = ({name: _join(lists, name) for name in tuple(lists)} for lists in (self._samples, self._rows))
-        return Visibilities(**samples, rows=RowTable(**rows), dropped=self.usable.dropped, alone=self.usable.alone, **about)
+        data = Visibilities(**samples, rows=RowTable(**rows))
+        ok = self.usable.compare(data, comm)
+        self.usable.count_alone((name, np.count_nonzero(ok[index])) for name, index in self._alone)
+        self.usable.merge(comm)
+        return data if ok.all() else data.part(np.flatnonzero(ok))
 
 
 def _formed(chunk, group, ok, weighted):
