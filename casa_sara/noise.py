@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.levels import levels
 from casa_sara.parallel import SERIAL
 from casa_sara.sharing import by_baseline
 
@@ -23,7 +24,9 @@ def noise_from_differences(visibilities, offsets, comm=SERIAL):
 
     hold the noise and what little of the sky curves in between. Where a block has too few
     of them, first differences V₁ − V₂ of variance 1/w₁ + 1/w₂ take their place. The noise is
-    1.4826 times the median of |Re d|/σ_d and |Im d|/σ_d together, which outliers hardly move.
+    1.4826 times the median of |Re d|/σ_d and |Im d|/σ_d together, which outliers hardly move. Where the weights of a
+    block fall into levels (:func:`casa_sara.levels.levels`), as when most rows are bad and hardly weighed, it is measured in
+    each: of levels of M_k samples the rms is √(Σ M_k·noise_k²/M), which a common median is not.
 
     Parameters
     ----------
@@ -66,6 +69,19 @@ def _block_noise(visibilities, block, series, comm):
     if not comm.total(np.count_nonzero(same)):
         return np.nan
     next_one = same & (step < 1.5 * comm.median(step[same]))
+    level, count = levels(visibilities.weight[block], comm)
+    level = level[order]
+    found = []
+    for number in reversed(range(count)):  # where differences are too few, the noise is that of the next heavier level
+        here = level == number
+        noise = _noise_of_pairs(vis, variance, next_one & here[:-1] & here[1:], comm)
+        found.append((comm.total(np.count_nonzero(here)), found[-1][1] if found and np.isnan(noise) else noise))
+    sizes, noises = np.array(found).T
+    return noises[0] if count == 1 else float(np.sqrt(np.average(np.square(noises), weights=sizes)))
+
+
+def _noise_of_pairs(vis, variance, next_one, comm):
+    """Return the noise of samples of which the next one is that of the next integration, bool (M − 1,), or NaN."""
     middle = next_one[:-1] & next_one[1:]
     if comm.total(np.count_nonzero(middle)) >= FEWEST_DIFFERENCES:
         difference = (vis[:-2] - 2 * vis[1:-1] + vis[2:])[middle]

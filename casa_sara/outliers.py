@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casa_sara.levels import APART, levels
 from casa_sara.noise import MEDIAN_TO_SIGMA, series_of_rows
 from casa_sara.parallel import SERIAL
 from casa_sara.sharing import series_with
 
 __all__ = ["WildSamples", "find_wild"]
 
-SIGNIFICANT = 20.0  # of the block's robust scale
+SIGNIFICANT = 20.0  # of the robust scale of its block and level of weights
 IMPOSSIBLE = 1.5  # times the flux of the image, which no visibility of a positive sky exceeds
 COMPARABLE = 0.2  # of the largest residual
 MOST = 0.01  # of the samples: more than that are not wild, the image is wrong
@@ -49,15 +50,16 @@ class WildSamples:
 def find_wild(data, offsets, residual, flux_jy, comm=SERIAL):
     """Find samples that a first image cannot have left for any reason but their own.
 
-    A sample is wild when its residual exceeds 20 times the scale of its block (1.4826 × the median of the whitened real and
-    imaginary parts) and what the image predicts for it, and when either
+    A sample is wild when its residual exceeds 20 times the scale of the samples of like weight in its block (1.4826 × the
+    median of the whitened real and imaginary parts) and what the image predicts for it, and when either
 
     - its amplitude exceeds 1.5 times the flux of the image, as no visibility of a positive sky does, or
     - it stands alone: the residuals of the same baseline and channel before and after it (median of up to four) differ from
       it by more than half of it, as what the image lacks, or a calibration error, would not.
 
     Of these only the ones within a factor 5 of the largest residual are named: they may have spoiled the image, and made
-    the others look wild, so a next image must tell.  Nothing is wild when more than 1 % of the samples would be.
+    the others look wild, so a next image must tell.  Nothing is wild when more than 1 % of the samples would be. Samples that
+    weigh less by a factor of 100 have no say: they are neither neighbours nor counted.
 
     Parameters
     ----------
@@ -79,13 +81,16 @@ def find_wild(data, offsets, residual, flux_jy, comm=SERIAL):
     size = np.abs(residual)
     scale = np.empty_like(size)
     for start, stop in zip(offsets[:-1], offsets[1:]):
-        block = residual[start:stop]
-        scale[start:stop] = MEDIAN_TO_SIGMA * comm.median(np.abs([block.real, block.imag]))
+        level, count = levels(data.weight[start:stop], comm)
+        for number in range(count):
+            here = slice(start, stop) if count == 1 else start + np.flatnonzero(level == number)
+            scale[here] = MEDIAN_TO_SIGMA * comm.median(np.abs([residual[here].real, residual[here].imag]))
     predicted = np.abs(data.vis - residual / np.sqrt(data.weight))
     suspect = np.flatnonzero((size > SIGNIFICANT * scale) & (size > predicted * np.sqrt(data.weight)))
     impossible = np.abs(data.vis[suspect]) > IMPOSSIBLE * flux_jy
     wild = suspect[impossible | _alone(*series_with(data, residual, suspect, comm))]
-    if comm.total(wild.size) > MOST * comm.total(data.size):
+    counted = data.weight >= comm.largest(data.weight[wild].max(initial=0)) / APART
+    if comm.total(wild.size) > MOST * comm.total(np.count_nonzero(counted)):
         wild = wild[:0]
     wild = wild[size[wild] >= COMPARABLE * comm.largest(size[wild].max(initial=0))]
     return WildSamples(wild, np.abs(data.vis[wild]), predicted[wild])
@@ -97,7 +102,17 @@ def _alone(data, residual, suspect):
         return np.zeros(0, bool)
     series = series_of_rows(data.rows)[data.row] * (int(data.chan.max()) + 1) + data.chan
     order = np.lexsort((data.rows.time[data.row], series))
-    place = np.empty_like(order)
+    alone = np.zeros(suspect.size, bool)
+    weight, decade = data.weight[order], np.floor(np.log10(data.weight[suspect]))
+    for number in np.unique(decade):
+        these, like = decade == number, (weight >= 10**number / APART) & (weight < 10 ** (number + 1) * APART)
+        alone[these] = _alone_among(order[like], series, residual, suspect[these])
+    return alone
+
+
+def _alone_among(order, series, residual, suspect):
+    """Return the same, with the neighbours out of the samples `order`, sorted by series and time."""
+    place = np.empty(series.size, order.dtype)
     place[order] = np.arange(order.size)
     around = np.full((len(NEIGHBOURS), suspect.size), np.nan + 0j)
     for k, step in enumerate(NEIGHBOURS):

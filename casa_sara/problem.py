@@ -18,6 +18,7 @@ from casa_sara.visibilities import Visibilities
 __all__ = ["Findings", "Problem", "Samples", "first_image"]
 
 ROUNDS = 6  # of leaving out wild samples
+LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
 @dataclass
@@ -79,7 +80,7 @@ class Problem:
         sqrt_weight *= np.float32(unit_jy)
         measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=sqrt_weight, eps=eps,
                                    nthreads=options.nthreads, comm=comm)
-        precond = _preconditioner(samples.density, options.precondition, comm)
+        precond = _preconditioner(samples, options.precondition, comm)
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
             data_norm_sq = comm.broadcast(power_method(
@@ -130,9 +131,15 @@ def first_image(samples, problem_of, options, stopped=lambda: False, comm=SERIAL
     return problem, Findings(left_out, wild, nnls_norms, problem.data_norm_sq), first
 
 
-def _preconditioner(density, wanted, comm):
-    """U = 1/density, largest value 1."""
+def _preconditioner(samples, wanted, comm):
+    """U = 1/density, largest value 1.
+
+    Samples of hardly any weight alone in their cells, as bad ones that were not flagged but weighed down, are not raised to what
+    other cells have: the density is taken to be at least 1e-2·Σw²/Σw.
+    """
+    weight = samples.data.weight
     if not wanted:
-        return np.ones(density.size, np.float32)
-    precond = 1.0 / np.asarray(density, float)
+        return np.ones(weight.size, np.float32)
+    mean = comm.total(float(np.square(weight, dtype=float).sum())) / comm.total(float(weight.sum(dtype=float)))
+    precond = 1.0 / np.maximum(np.asarray(samples.density, float), LIGHT * mean)
     return (precond / comm.largest(precond.max(initial=0))).astype(np.float32)

@@ -43,7 +43,7 @@ class Visibilities:
         Inverse variance of the real part, and of the imaginary part, in 1/Jy²:
         4 / (1/w_RR + 1/w_LL), exact when WEIGHT = 1/SIGMA².
     imaging_weight : float32 (M,)
-        tclean's natural gridding weight, (w_RR + w_LL) / 2.
+        tclean's natural gridding weight, (w_RR + w_LL) / 2 of RR (first) to LL (last).
     uvw : float64 (3, M)
         Baselines in wavelengths at the LSRK frequency of the integration.
     row : int32 (M,)
@@ -54,6 +54,8 @@ class Visibilities:
     ms_names : tuple of str
     dropped : dict
         Reason → number of samples that were left out.
+    alone : dict
+        Correlation → number of samples that are of it alone, because the other hand has no weight.
     notes : list of str
         Warnings that the user must see, also in the record of the run.
     phase_center : dict
@@ -78,6 +80,7 @@ class Visibilities:
     rows: RowTable
     ms_names: tuple[str, ...] = ()
     dropped: dict[str, int] = field(default_factory=dict)
+    alone: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     phase_center: dict = field(default_factory=dict)
     freq_range_hz: tuple[float, float] = (0.0, 0.0)

@@ -68,23 +68,26 @@ def explicit_samples(name, hands, col="CORRECTED_DATA", weight_spectrum=False):
         for chan in range(data.shape[1]):
             vis = [data[hand, chan] for hand in hands]
             weight = [weights[hand, chan] for hand in hands]
+            heaviest = max((w for w in weight if w > 0), default=0)
+            used = [k for k, w in enumerate(weight) if w > 0 and w >= 1e-6 * heaviest]
             if auto:
                 reason = "autocorrelation"
             elif tb.getcell("FLAG_ROW", row):
                 reason = "flagged row"
             elif any(flag[:, chan]):
                 reason = "flagged"
-            elif not all(np.isfinite(v) for v in vis):
+            elif not all(np.isfinite(vis[k]) for k in used):
                 reason = "non-finite data"
-            elif not all(np.isfinite(w) for w in weight):
+            elif any(np.isinf(w) for w in weight) or not used and any(np.isnan(w) for w in weight):
                 reason = "non-finite weight"
-            elif any(w <= 0 for w in weight):
+            elif not used:
                 reason = "non-positive weight"
             elif not all(np.isfinite(x) for x in uvw):
                 reason = "non-finite uvw"
             else:
-                whitening = len(hands) ** 2 / sum(1 / w for w in weight)
-                samples[row, chan] = sum(vis) / len(hands), whitening, sum(weight) / len(hands)
+                whitening = len(used) ** 2 / sum(1 / weight[k] for k in used)
+                samples[row, chan] = (sum(vis[k] for k in used) / len(used), whitening,
+                                      sum(weight[k] for k in used) / len(hands))
                 continue
             counts[reason] = counts.get(reason, 0) + 1
     tb.close()
@@ -120,14 +123,15 @@ def test_samples_equal_a_cell_by_cell_read(tmp_path, correlations, hands):
     edit(name, "CORRECTED_DATA", spoil(0.03, np.nan + 0j))
     edit(name, "CORRECTED_DATA", spoil(0.03, 1j * np.inf))
     for value in (0.0, -1.0, np.inf, np.nan):
-        edit(name, "WEIGHT", spoil(0.03, value))
+        edit(name, "WEIGHT", spoil(0.1, value))
     edit(name, "UVW", spoil(0.02, np.inf))
     vis = read(name)
     samples, counts = explicit_samples(name, hands)
     assert_same_samples(vis, samples)
     assert vis.dropped == counts and len(counts) == 7
     assert any("unflagged samples cannot be used" in note for note in vis.notes)
-    assert any("alone" in note for note in vis.notes) == (count == 1)
+    assert any("alone: " in note for note in vis.notes) == (count == 1)
+    assert bool(vis.alone) == any("alone, because the other" in note for note in vis.notes) == (len(hands) == 2)
 
 
 def test_dtypes_and_layout(observation):

@@ -90,3 +90,12 @@ def test_nan_where_it_cannot_be_measured():
     assert np.isnan(noise_from_differences(single, whole(single)))
     few = noisy([(0, 0, 1, 0, 2)], channels=1)  # ten differences
     assert np.isnan(noise_from_differences(few, whole(few)))
+
+
+def test_rows_that_are_hardly_weighed_do_not_hide_the_noise_of_the_others():
+    """The bound of a block needs the rms of its whitened samples: of 40 % with the noise that was put in, and of 60 % of nothing."""
+    vis = noisy(ONE_SCAN, 2.0, channels=8)
+    light = np.random.default_rng(7).random(vis.rows.row.size)[vis.row] < 0.6
+    vis.weight[light] *= 1e-8
+    found, rms = noise_from_differences(vis, whole(vis)), np.sqrt(np.mean(~light)) * 2
+    np.testing.assert_allclose(found, rms, rtol=0.1)

@@ -72,3 +72,22 @@ def test_a_wrong_image_makes_no_sample_wild():
     data, offsets, model = case()
     data.vis[::50] += 1e3
     assert found(data, offsets, model).index.size == 0
+
+
+def test_samples_that_are_hardly_weighed_have_no_say():
+    """What the image lacks of one baseline for a while, between such samples, does not stand alone; one sample does."""
+    data, offsets, model = case([(0, 0, k, 1000 * k, 60) for k in range(8)])
+    rows, light = data.rows, np.random.default_rng(3).random(data.rows.row.size)[data.row] < 0.6
+    data.weight[light] *= 1e-8
+    series = (rows.antenna2[data.row] == 4) & (data.chan == 0)
+    lacking = series * 60 * np.exp(-(((rows.time[data.row] - 300) / 150) ** 2))  # times the noise
+    assert 3 < np.count_nonzero((lacking > 25) & ~light) < 0.01 * np.count_nonzero(~light)
+    data.vis += (NOISE * lacking).astype(np.complex64)
+
+    def wild():
+        return find_wild(data, offsets, (data.vis - model) * np.sqrt(data.weight), FLUX).index.tolist()
+
+    assert wild() == []
+    spoiled = np.flatnonzero(~light & (rows.antenna2[data.row] == 2))[3]
+    data.vis[spoiled] += 1e3
+    assert wild() == [spoiled]

@@ -48,12 +48,13 @@ ROOMS = {
     "options": set(),
     "visibilities": {"numpy"},
     "snapshots": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
-    "noise": {"casa_sara.parallel", "casa_sara.sharing", "numpy"},
+    "levels": {"casa_sara.parallel", "numpy"},
+    "noise": {"casa_sara.levels", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
     "cautions": {"casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy"},
-    "outliers": {"casa_sara.noise", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
+    "outliers": {"casa_sara.levels", "casa_sara.noise", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
     "casa": {
-        "casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.options", "casa_sara.parallel", "casa_sara.sharing",
-        "casa_sara.snapshots", "casa_sara.visibilities", "numpy", "scipy", "astropy", *CASA,
+        "casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.levels", "casa_sara.options", "casa_sara.parallel",
+        "casa_sara.sharing", "casa_sara.snapshots", "casa_sara.visibilities", "numpy", "scipy", "astropy", *CASA,
     },
     "operators": {
         "casa_sara.options", "casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy", "finufft", "ducc0", "numba",
@@ -64,7 +65,7 @@ ROOMS = {
     "jsonfile": set(),
 }
 LIBRARY = (
-    "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "noise", "cautions", "outliers", "problem", "papermethod", "operators", "solver",
+    "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions", "outliers", "problem", "papermethod", "operators", "solver",
     "analysis",
 )
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from casa_sara.casa.frames import Geometry, image_direction, is_of_earth, on_sky, separation
 from casa_sara.casa.integrity import reading
-from casa_sara.casa.selection import select_data
+from casa_sara.casa.selection import UNPOLARISED, select_data
 from casa_sara.casa.tools import opened
-from casa_sara.casa.usable import IN_FLAGS, SMALLEST, Usability
+from casa_sara.casa.usable import IN_FLAGS, LIGHTEST, SMALLEST, Usability
 from casa_sara.sharing import ALONE
 from casa_sara.visibilities import RowTable, Visibilities
 
@@ -37,21 +37,25 @@ _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw"
 def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, crew=ALONE):
     """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
 
-    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one hand there is, and as tclean (of circular, or of linear feeds)
+    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel hand there is, and as tclean (of circular, or of linear
+    feeds)
 
         V_Q = (V_RL + V_LR)/2,  (V_XX − V_YY)/2;    V_U = (V_RL − V_LR)/2i,  (V_XY + V_YX)/2;
-        V_V = (V_RR − V_LL)/2,  (V_XY − V_YX)/2i.
+        V_V = (V_RR − V_LL)/2,  (V_XY − V_YX)/2i;
 
-    A sample is left out
-    when any of its correlations is flagged (cross-hands too, as in tclean), when its row is
-    flagged or an autocorrelation, and when data, weights or uvw cannot be used; what was left
-    out is counted by the first reason that applies. Weights are WEIGHT_SPECTRUM where it is
-    filled, else WEIGHT, whatever the data column (as in tclean).
+    where the Stokes parameter itself is stored, it is taken as it stands.
+
+    A sample is left out when any of its correlations is flagged (cross-hands too, as in tclean), when its row is flagged or
+    an autocorrelation, and when data, weights or uvw cannot be used; what was left out is counted by the first reason that
+    applies. Weights are WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the data column (as in tclean). Where one
+    parallel hand has no weight (0, negative or NaN), Stokes I is the other one, with its weight; tclean takes the mean of
+    both there.
 
     The inverse variance of Re V_I and of Im V_I follows from those of the hands:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
     WEIGHT = 1/SIGMA² with SIGMA the scatter of the real and of the imaginary part. The same holds for Q, U and V of
-    theirs. tclean's imaging weight is the mean of the parallel hands, whatever the Stokes parameter.
+    theirs. tclean's imaging weight is the mean of those of the first and the last correlation, in the order of the
+    MeasurementSet and whatever the Stokes parameter: of RR, RL, LR, LL the mean of the parallel hands.
 
     The MeasurementSets are opened read-only and stay as they are, byte by byte.
 
@@ -83,39 +87,41 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     image = image_direction(phasecenter, selected)
     _check_directions(phasecenter, image, selected)
     comm = crew.comm
-    table, sizes, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, crew), frequencies)
-    sizes, ranges = np.sum(comm.gather(sizes), axis=0), np.concatenate(comm.gather(ranges))
-    unused = [f"no sample of '{ms.name}' can be used: nothing of it is imaged" for ms, size in zip(selected, sizes) if not size]
-    low, high = float(ranges[:, 0].min()), float(ranges[:, 1].max())
-    table.usable.merge(comm)
-    dropped = table.usable.dropped
-    if sizes.sum() == 0:
-        raise ValueError(f"vis: no sample of {', '.join(selection.vis)} can be used: {_counts(dropped)}")
-    if table.usable.strongest < SMALLEST:
-        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {sizes.sum()} samples of "
+    table, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, crew), frequencies)
+    ranges = np.concatenate(comm.gather(ranges))
+    data = table.usable_visibilities(comm)
+    usable, size = table.usable, comm.total(data.size)
+    rows_of = comm.sum(np.bincount(data.rows.ms, minlength=len(selection.vis)))
+    unused = [f"no sample of '{ms.name}' can be used: nothing of it is imaged" for ms in selected if not rows_of[ms.number]]
+    if size == 0:
+        raise ValueError(f"vis: no sample of {', '.join(selection.vis)} can be used: {_counts(usable.dropped)}")
+    if usable.strongest < SMALLEST:
+        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {size} samples of "
                          f"{', '.join(selection.vis)} that can be used are zero: it may never have been filled")
-    return table.visibilities(
+    return replace(
+        data,
         ms_names=tuple(selection.vis),
-        notes=notes + unused + _notes(selected, dropped),
+        dropped=usable.dropped,
+        alone=usable.alone,
+        notes=notes + unused + _notes(selected, usable),
         phase_center=image,
-        freq_range_hz=(low, high),
+        freq_range_hz=(float(ranges[:, 0].min()), float(ranges[:, 1].max())),
         spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
         observatory=selected[0].observatory,
     )
 
 
 def _read_all(selected, image, pieces, frequencies):
-    """Return the table of the samples in these pieces, and the number of samples and the frequencies of each MeasurementSet."""
-    table, sizes, ranges = _SampleTable(frequencies), [], []
+    """Return the table of the samples in these pieces, and the frequencies of each MeasurementSet."""
+    table, ranges = _SampleTable(frequencies), []
     for ms in selected:
-        geometry, before = Geometry(ms, image), table.size
+        geometry = Geometry(ms, image)
         with reading(ms.name), opened("table", ms.name) as tb:
             for number, group in enumerate(ms.groups):
                 for chunk in _chunks(tb, ms, group, pieces[ms.number, number]):
                     table.add(chunk, ms, group, geometry)
-        sizes.append(table.size - before)
         ranges.append(tuple(geometry.freq_range_hz))
-    return table, sizes, ranges
+    return table, ranges
 
 
 def _own_pieces(selected, crew):
@@ -140,16 +146,20 @@ def _pieces(group):
 
 @dataclass
 class _Chunk:
-    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `parallel` the parallel hands' weights."""
+    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `weighing` tclean's two weights.
+
+    `either` is that of the RowGroup.
+    """
 
     rows: np.ndarray
     columns: dict[str, np.ndarray]
     uvw_m: np.ndarray
     vis: list[np.ndarray]
     weight: list[np.ndarray]
-    parallel: list[np.ndarray]
+    weighing: list[np.ndarray]
     flag: np.ndarray
     flag_row: np.ndarray
+    either: bool
 
 
 def _chunks(tb, ms, group, pieces):
@@ -184,9 +194,10 @@ def _read(part, rows, column, weights, group):
         uvw_m=part.getcol("UVW"),
         vis=[vis[hand] for hand in group.hands],
         weight=of_hands,
-        parallel=of_hands if group.parallel == group.hands else [weight[hand] for hand in group.parallel],
+        weighing=of_hands if group.weighing == group.hands else [weight[hand] for hand in group.weighing],
         flag=np.any(planes("FLAG"), axis=0),
         flag_row=part.getcol("FLAG_ROW"),
+        either=group.either,
     )
 
 
@@ -202,31 +213,30 @@ class _SampleTable:
 
     def __init__(self, frequencies):
         self.usable = Usability()
-        self.size = 0
-        self._rows_so_far = 0
+        self._size = self._rows_so_far = 0
+        self._alone = []
         self._samples = {name: [np.empty((3, 0) if name == "uvw" else 0, dtype)] for name, dtype in _SAMPLE_DTYPES.items()
                          if frequencies or name != "freq_hz"}
         self._rows = {name: [np.empty(0, _ROW_DTYPES.get(name, np.int32))] for name in RowTable.__dataclass_fields__}
 
     def add(self, chunk, ms, group, geometry):
         """Whiten, turn and append the usable samples of a chunk."""
-        ok = self.usable(chunk)
+        ok, weighted = self.usable(chunk)
         columns = chunk.columns
         kept = ok.any(axis=1)
         uvw, shift = geometry.wavelengths(group, columns["field"], columns["time"], np.where(kept, chunk.uvw_m, 0.0))
-        hands = len(chunk.vis)
-        vis = chunk.vis[0][ok]
-        if hands == 2:
-            vis = (vis + group.sign * chunk.vis[1][ok]) / group.divisor
+        vis, weight, alone = _formed(chunk, group, ok, weighted)
+        self._alone += [(group.correlations[hand], self._size + np.flatnonzero(here))
+                        for hand, here in zip(group.hands, alone) if here.any()]
         if shift is not None:
             vis *= np.exp(-2j * np.pi * shift[ok])
-        weight = [hand[ok] for hand in chunk.weight]
+        hands = len(chunk.vis)
         number = self._rows_so_far + np.cumsum(kept) - 1
         channel = np.broadcast_to(group.channels, ok.shape)
         new = {
             "vis": vis,
-            "weight": hands**2 / sum(1 / hand for hand in weight),
-            "imaging_weight": sum(hand[ok] for hand in chunk.parallel) / len(chunk.parallel),
+            "weight": weight,
+            "imaging_weight": _imaging_weight([hand[ok] for hand in chunk.weighing], alone, weight / hands),
             "uvw": np.array([axis[ok] for axis in uvw]),
             "row": np.repeat(number, ok.sum(axis=1)),
             "chan": channel[ok],
@@ -240,12 +250,43 @@ class _SampleTable:
         for name, values in (columns | of_group | {"row": chunk.rows}).items():
             self._rows[name].append(values[kept].astype(_ROW_DTYPES.get(name, np.int32)))
         self._rows_so_far += int(kept.sum())
-        self.size += vis.size
+        self._size += vis.size
 
-    def visibilities(self, **about):
-        """Join the chunks, one column after the other to keep the peak of memory low."""
+    def usable_visibilities(self, comm):
+        """Join the chunks, leave out what is out of proportion to all others, and add up the counts of all ranks."""
+        # one column after the other, to keep the peak of memory low
         samples, rows = ({name: _join(lists, name) for name in tuple(lists)} for lists in (self._samples, self._rows))
-        return Visibilities(**samples, rows=RowTable(**rows), dropped=self.usable.dropped, **about)
+        data = Visibilities(**samples, rows=RowTable(**rows))
+        ok = self.usable.compare(data, comm)
+        self.usable.count_alone((name, np.count_nonzero(ok[index])) for name, index in self._alone)
+        self.usable.merge(comm)
+        return data if ok.all() else data.part(np.flatnonzero(ok))
+
+
+def _formed(chunk, group, ok, weighted):
+    """Return the Stokes parameter of the samples that are `ok` and its inverse variance, and where it is of one hand alone.
+
+    Returns
+    -------
+    vis, weight : (M,)
+    alone : list of bool (M,)
+        For each hand, where it alone has a weight.
+    """
+    vis, weight = ([hand[ok] for hand in hands] for hands in (chunk.vis, chunk.weight))
+    if len(vis) == 1:
+        return vis[0], weight[0], []
+    with np.errstate(divide="ignore", invalid="ignore"):
+        formed, total = (vis[0] + group.sign * vis[1]) / group.divisor, 4 / (1 / weight[0] + 1 / weight[1])
+    alone = [~there[ok] for there in reversed(weighted)]
+    for here, one, its_weight in zip(alone, vis, weight):
+        formed[here], total[here] = one[here], its_weight[here]
+    return formed, total, alone
+
+
+def _imaging_weight(weighing, alone, otherwise):
+    """Return the mean of tclean's two weights, and what the noise says, `otherwise`, where one of them cannot be used."""
+    unusable = np.any([*alone, *(~(weight >= LIGHTEST) for weight in weighing)], axis=0)
+    return np.where(unusable, otherwise, sum(weighing) / len(weighing))
 
 
 def _join(lists, name):
@@ -268,10 +309,11 @@ def _counts(dropped):
     return ", ".join(f"{count} samples left out as {reason}" for reason, count in dropped.items())
 
 
-def _notes(selected, dropped):
+def _notes(selected, usable):
     """Return the warnings that the data themselves give rise to."""
-    notes = []
-    unusable = {reason: count for reason, count in dropped.items() if reason not in IN_FLAGS}
+    notes = [f"{count} samples are of {name} alone, because the other hand has no weight: {UNPOLARISED}"
+             for name, count in usable.alone.items()]
+    unusable = {reason: count for reason, count in usable.dropped.items() if reason not in IN_FLAGS}
     if unusable:
         notes.append(f"unflagged samples cannot be used: {_counts(unusable)}")
     notes += [f"field {number} of '{ms.name}' is in {direction['refer']}: it is followed on the sky, integration by integration"

@@ -16,12 +16,13 @@ from casa_sara.casa.integrity import check_measurement_set, reading
 from casa_sara.casa.msselect import MSSELECT_KEYS, in_words, msselect
 from casa_sara.casa.tools import opened
 
-__all__ = ["RowGroup", "SelectedMS", "select_data"]
+__all__ = ["UNPOLARISED", "RowGroup", "SelectedMS", "select_data"]
 
+UNPOLARISED = "it is imaged as Stokes I, as if the source were unpolarised"
 _DATA_COLUMNS = {"corrected": "CORRECTED_DATA", "data": "DATA", "observed": "DATA"}
-_STOKES_CODES = {1: "I", 5: "RR", 6: "RL", 7: "LR", 8: "LL", 9: "XX", 10: "XY", 11: "YX", 12: "YY"}
+_STOKES_CODES = {1: "I", 2: "Q", 3: "U", 4: "V", 5: "RR", 6: "RL", 7: "LR", 8: "LL", 9: "XX", 10: "XY", 11: "YX", 12: "YY"}
+_PARALLEL = (5, 8, 9, 12)
 _LAST_CHANNEL = 32767
-_SINGLE = {1, 5, 8, 9, 12}
 # Stokes parameter → ways to form it: two correlations a and b, s and d of (a + s·b)/d
 _FORMED = {
     "I": ((5, 8, 1, 2), (9, 12, 1, 2)),
@@ -42,9 +43,10 @@ class RowGroup:
     channels : int64 (C,), selected channel numbers, increasing
     freqs_hz, widths_hz : float64 (C,), centres and widths in `frame`
     frame : str, reference of the frequencies ('TOPO', 'LSRK', …)
-    hands : tuple of one or two int, where the correlations stand that form the Stokes parameter
+    hands : tuple of one or two int, where the correlations stand that form the Stokes parameter; () where none was asked for
     sign, divisor : it is (first + sign·second)/divisor
-    parallel : tuple of int, where the parallel hands stand, whose weights are tclean's imaging weights
+    either : bool, whether one of the two will do where the other has no weight, as if the source were unpolarised
+    weighing : tuple of int, the first correlation and the last: tclean's imaging weight is the mean of theirs
     correlations : tuple of str, all the correlations of the rows
     """
 
@@ -58,7 +60,8 @@ class RowGroup:
     correlations: tuple[str, ...]
     sign: int = 1
     divisor: complex = 2
-    parallel: tuple[int, ...] = ()
+    either: bool = False
+    weighing: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -86,14 +89,14 @@ class SelectedMS:
     start_s: float
 
 
-def select_data(selection, stokes="I"):
+def select_data(selection, stokes=""):
     """Apply the selection to every MeasurementSet.
 
     Parameters
     ----------
     selection : casa_sara.options.Selection
     stokes : str
-        'I', 'Q', 'U' or 'V'.
+        'I', 'Q', 'U' or 'V', which must be in the data; '' where their correlations do not matter.
 
     Returns
     -------
@@ -211,23 +214,29 @@ def _position(md, observation):
 
 
 def _formation(name, spw, codes, stokes, notes):
-    """Return how a Stokes parameter is formed of the correlations `codes`: hands, sign, divisor and parallel hands."""
-    parallel = tuple(codes.index(code) for code in (5, 8, 9, 12) if code in codes)
-    for first, second, sign, divisor in _FORMED[stokes]:
+    """Return how a Stokes parameter is formed of the correlations `codes`: the fields `hands` to `weighing` of a RowGroup."""
+    weighing = tuple(sorted({0, len(codes) - 1}))
+    alone = dict(hands=(), divisor=1, weighing=weighing)
+    for number, code in enumerate(codes):  # the Stokes parameter itself
+        if _STOKES_CODES.get(code) == stokes:
+            return alone | dict(hands=(number,))
+    for first, second, sign, divisor in _FORMED.get(stokes, ()):
         if {first, second} <= set(codes):
-            return dict(hands=(codes.index(first), codes.index(second)), sign=sign, divisor=divisor, parallel=parallel)
-    if stokes == "I" and len(codes) == 1 and codes[0] in _SINGLE:
-        if codes[0] != 1:
-            hand = _STOKES_CODES[codes[0]]
-            note = f"'{name}' holds {hand} alone: it is imaged as Stokes I, as if the source were unpolarised"
-            if note not in notes:
-                notes.append(note)
-        return dict(hands=(0,), divisor=1, parallel=(0,))
+            return dict(hands=(codes.index(first), codes.index(second)), sign=sign, divisor=divisor, either=stokes == "I",
+                        weighing=weighing)
+    parallel = [number for number, code in enumerate(codes) if code in _PARALLEL]
+    if stokes == "I" and parallel:
+        note = f"'{name}' holds {_STOKES_CODES[codes[parallel[0]]]} alone: {UNPOLARISED}"
+        if note not in notes:
+            notes.append(note)
+        return alone | dict(hands=(parallel[0],))
+    if not stokes:
+        return alone
     names = ", ".join(_STOKES_CODES.get(code, f"type {code}") for code in codes)
     ways = ", or ".join(f"{_STOKES_CODES[first]} and {_STOKES_CODES[second]}" for first, second, *_ in _FORMED[stokes])
     raise ValueError(
-        f"stokes = '{stokes}' cannot be formed from the correlations {names} of spw {spw} in '{name}': "
-        f"it takes {ways}{', or one of them alone' if stokes == 'I' else ''}; other spws can be selected with spw"
+        f"stokes = '{stokes}' cannot be formed from the correlations {names} of spw {spw} in '{name}': it takes {ways}"
+        f"{', or one of them alone' if stokes == 'I' else ''}, or {stokes} itself; other spws can be selected with spw"
     )
 
 

@@ -214,8 +214,10 @@ class _tsara:
     stokes : {'I', 'Q', 'U', 'V'}, default 'I'
         One of I, Q, U and V. I is formed from RR and LL, from XX and YY, or from one of the two where
         only one was recorded; Q and U take RL and LR, V takes RR and LL; of linear feeds Q takes XX
-        and YY, U and V take XY and YX. Q, U and V may be negative: they need positivity=False.
-        As in tclean, a sample with any correlation flagged is not used.
+        and YY, U and V take XY and YX. One that is stored as such is taken as it stands; other
+        correlations beside those needed, and their order, do not matter. Q, U and V may be negative:
+        they need positivity=False. As in tclean, a sample with any correlation flagged
+        is not used; where only the weight of a parallel hand is 0, negative or NaN, I is the other one.
 
     projection : {'SIN'}, default 'SIN'
         Only SIN: the projection in which an interferometer sees the sky.
