@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from casa_sara.casa.subtables import readable
 from casa_sara.casa.tools import opened
 
 __all__ = ["check_measurement_set", "reading"]
@@ -20,14 +21,16 @@ def reading(name):
     """Turn what CASA and Python say of an unreadable MeasurementSet into a ValueError that names `vis`."""
     try:
         yield
-    except (RuntimeError, UnicodeDecodeError) as error:
-        raise ValueError(f"vis = '{name}' cannot be read: {' '.join(str(error).split())}") from error
+    except (RuntimeError, UnicodeDecodeError, SystemError) as error:
+        words = " ".join(str(error).split())
+        raise ValueError(f"vis = '{name}' cannot be read: {words}") from error
 
 
 def check_measurement_set(name):
     """Raise unless `name` is a MeasurementSet with rows, whose numbers CASA survives.
 
-    msmetadata ends the process at a frequency that is no number, and never returns from such a time.
+    msmetadata ends the process at a frequency that is no number, and never returns from such a time. Subtables with
+    something wrong are set right in a copy (:func:`casa_sara.casa.subtables.readable`), or refused where all is wrong.
 
     Raises
     ------
@@ -56,30 +59,20 @@ def check_measurement_set(name):
 
 
 def _check_numbers(name):
-    """Raise on times, fields and frequencies that are none."""
-    fields = _cells(name, "FIELD", "PHASE_DIR")
-    for row, direction in enumerate(fields):
-        _check(name, "FIELD/PHASE_DIR", row, direction, np.isfinite(direction), "finite")
-    for column in ("CHAN_FREQ", "CHAN_WIDTH"):
-        for row, values in enumerate(_cells(name, "SPECTRAL_WINDOW", column)):
-            right = np.isfinite(values) & ((values > 0) if column == "CHAN_FREQ" else (values != 0))
-            _check(name, f"SPECTRAL_WINDOW/{column}", row, values, right, "a frequency in Hz")
+    """Raise on times and fields that are none."""
+    readable(name)
+    with opened("table", os.path.join(name, "FIELD")) as tb:
+        fields = tb.nrows()
     with opened("table", name) as tb:
         time, interval, field = (tb.getcol(column) for column in ("TIME", "INTERVAL", "FIELD_ID"))
     for column, values, right, words in (
         ("TIME", time, (time >= 0) & (time < _LATEST_S), "a time in MJD seconds"),
         ("INTERVAL", interval, np.isfinite(interval), "a number of seconds"),
-        ("FIELD_ID", field, (field >= 0) & (field < len(fields)), f"a row of FIELD, 0 to {len(fields) - 1}"),
+        ("FIELD_ID", field, (field >= 0) & (field < fields), f"a row of FIELD, 0 to {fields - 1}"),
     ):
         if not right.all():
             row = int(np.argmin(right))
             _check(name, column, row, values[row], right[row], words)
-
-
-def _cells(name, subtable, column):
-    """Return the array in every row of one column of a subtable."""
-    with opened("table", os.path.join(name, subtable)) as tb:
-        return [np.asarray(tb.getcell(column, row)) for row in range(tb.nrows())]
 
 
 def _check(name, column, row, values, right, words):

@@ -14,6 +14,7 @@ import numpy as np
 
 from casa_sara.casa.integrity import check_measurement_set, reading
 from casa_sara.casa.msselect import MSSELECT_KEYS, in_words, msselect
+from casa_sara.casa.subtables import check_rows, readable, texts
 from casa_sara.casa.tools import opened
 
 __all__ = ["RowGroup", "SelectedMS", "select_data"]
@@ -169,11 +170,13 @@ def _describe(number, name, column, rows, wanted, notes):
         for first in (int(rows[description == dd][0]) for dd in np.unique(description)):
             if not tb.iscelldefined(column, first):
                 raise ValueError(f"the {column} column of '{name}' is empty at row {first}")
+    check_rows(name, FIELD=field_ids, DATA_DESCRIPTION=np.unique(description))
     _refuse_moving(name, field_ids)
-    with opened("msmetadata", name) as md:
+    with opened("msmetadata", readable(name)) as md:
         groups = []
         for dd in np.unique(description):
             spw = md.spwfordatadesc(int(dd))
+            check_rows(name, SPECTRAL_WINDOW=[spw], POLARIZATION=[md.polidfordatadesc(int(dd))])
             codes = np.ravel(md.corrtypesforpol(md.polidfordatadesc(int(dd)))).tolist()
             chosen = channels.get(spw, np.arange(md.nchan(spw)))
             if chosen[-1] > _LAST_CHANNEL:
@@ -233,12 +236,12 @@ def _formation(name, spw, codes, stokes, notes):
 
 def _refuse_moving(name, field_ids):
     """Raise when a selected field moves on the sky: its phase centre is not one direction."""
-    with opened("table", os.path.join(name, "FIELD")) as tb:
-        moving = tb.getcol("NUM_POLY")[field_ids] > 0
+    with opened("table", os.path.join(readable(name), "FIELD")) as tb:
+        moving = np.array([np.any(tb.getcell("PHASE_DIR", int(number))[:, 1:]) for number in field_ids])
         if "EPHEMERIS_ID" in tb.colnames():
             moving |= tb.getcol("EPHEMERIS_ID")[field_ids] >= 0
-        names = np.array(tb.getcol("NAME"))[field_ids]
     if moving.any():
+        names = np.array(texts(name, "FIELD", "NAME"))[field_ids]
         raise ValueError(
             f"field {field_ids[moving].tolist()} ({', '.join(names[moving])}) of '{name}' moves on the sky "
             "(ephemeris or polynomial): moving sources cannot be imaged, select other fields"

@@ -10,7 +10,7 @@ import numpy as np
 
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.regrid import PixelMap, corners, interpolated, on_plane
-from casa_sara.casa.tools import opened
+from casa_sara.casa.tools import opened, safe_record
 
 __all__ = ["SkyImage", "SkyPlane", "beam_numbers", "read_header", "read_sky_image"]
 
@@ -142,7 +142,7 @@ def read_sky_image(name, parameter, units):
             _check_axes(name, parameter, shape, csys)
             csys.setunits(["rad", "rad", *csys.units()[2:]])
             pixels = read_pixels(ia)
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
     unit = _SPELLINGS.get(unit.lower(), unit)
     if units is not None and unit not in units:
@@ -152,7 +152,7 @@ def read_sky_image(name, parameter, units):
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
-    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(csys.torecord(), shape[:2]), _parameters(history))
+    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]), _parameters(history))
 
 
 def read_header(name):

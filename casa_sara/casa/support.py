@@ -8,7 +8,7 @@ import numpy as np
 
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.images import write_image
-from casa_sara.casa.tools import opened, scratch_folder
+from casa_sara.casa.tools import made, opened, scratch_folder
 
 __all__ = ["read_support"]
 
@@ -74,7 +74,7 @@ def _mask_of(entry, plane):
                              f"{' '.join(str(error).split())}") from error
         finally:
             deconvolver.done()
-        with opened("image", root + ".mask") as ia:
+        with opened("image", made(root + ".mask", f"mask = '{entry}'")) as ia:
             return read_pixels(ia) > 0
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import shutil
 import tempfile
 from contextlib import contextmanager
 
-__all__ = ["opened", "scratch_folder"]
+__all__ = ["made", "opened", "safe_record", "scratch_folder"]
 
 
 @contextmanager
@@ -22,6 +23,34 @@ def opened(tool_name, *args, **options):
         yield tool
     finally:
         tool.close()
+
+
+def made(path, parameter):
+    """Return the path of what CASA was asked to make; where it failed it may have said so in its log only.
+
+    Parameters
+    ----------
+    path : str
+    parameter : str
+        Task parameter with its value, for the message.
+
+    Raises
+    ------
+    ValueError
+    """
+    if not os.path.exists(path):
+        raise ValueError(f"{parameter}: CASA makes no {os.path.splitext(path)[1]} image of it; the reason stands in its log")
+    return path
+
+
+def safe_record(csys):
+    """Return the record of a coordinate system; CASA ends the process where its observer or telescope is not UTF-8."""
+    for read, write in ((csys.observer, csys.setobserver), (csys.telescope, csys.settelescope)):
+        try:
+            read()
+        except UnicodeDecodeError:
+            write("")
+    return csys.torecord()
 
 
 @contextmanager
