@@ -14,7 +14,7 @@ from casa_sara.casa.integrity import reading
 from casa_sara.casa.msselect import for_parser
 from casa_sara.casa.quantities import check_frequency
 from casa_sara.casa.subtables import readable
-from casa_sara.casa.tools import made, opened, scratch_folder
+from casa_sara.casa.tools import check_handles, made, more_handles, opened, scratch_folder
 
 __all__ = ["ImagePlane", "define_image_plane", "read_pixels", "slabs"]
 
@@ -95,9 +95,10 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
         check_frequency(grid.reffreq, "reffreq")
     with scratch_folder((*grid.shape, channels)) as folder:
         root = os.path.join(folder, "plane")
-        known = _make_primary_beam(visibilities, selection, grid, root)
-        if not known:  # for the coordinates
-            _make_primary_beam(visibilities, selection, grid, root, diameters=True)
+        with more_handles(selection.vis):
+            known = _make_primary_beam(visibilities, selection, grid, root)
+            if not known:  # for the coordinates
+                _make_primary_beam(visibilities, selection, grid, root, diameters=True)
         path = made(root + ".pb", f"vis = {list(selection.vis)}")
         with opened("image", path) as ia:
             pb = _read_planes(ia) if grid.is_cube else read_pixels(ia)
@@ -164,6 +165,7 @@ def _make_primary_beam(visibilities, selection, grid, root, diameters=False):
     imager = casatools.synthesisimager()
     try:
         for number in _by_start(visibilities):
+            check_handles(selection.vis[number], selection.vis)
             with reading(selection.vis[number]):
                 imager.selectdata(_selection_record(selection, number, diameters))
         try:
