@@ -26,6 +26,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
+import casatools
 import numpy as np
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests" / folder) for folder in ("", "faults")]
@@ -110,7 +111,116 @@ def _as_type(kind):
     return converted
 
 
-TABLES = {"main": main_cases}
+TEXTS = {
+    "ANTENNA": "MOUNT NAME STATION TYPE", "FIELD": "CODE NAME", "FLAG_CMD": "COMMAND REASON TYPE",
+    "HISTORY": "APPLICATION MESSAGE ORIGIN", "OBSERVATION": "OBSERVER PROJECT SCHEDULE_TYPE TELESCOPE_NAME", "POINTING": "NAME",
+    "PROCESSOR": "SUB_TYPE TYPE", "SOURCE": "CODE NAME", "SPECTRAL_WINDOW": "FREQ_GROUP_NAME NAME", "STATE": "OBS_MODE",
+}
+INTEGERS = {
+    "DATA_DESCRIPTION": "POLARIZATION_ID SPECTRAL_WINDOW_ID",
+    "FEED": "ANTENNA_ID BEAM_ID FEED_ID NUM_RECEPTORS SPECTRAL_WINDOW_ID",
+    "FIELD": "NUM_POLY SOURCE_ID", "POINTING": "ANTENNA_ID NUM_POLY", "POLARIZATION": "NUM_CORR",
+    "SOURCE": "CALIBRATION_GROUP NUM_LINES SOURCE_ID SPECTRAL_WINDOW_ID",
+    "SPECTRAL_WINDOW": "FREQ_GROUP IF_CONV_CHAIN MEAS_FREQ_REF NET_SIDEBAND NUM_CHAN", "STATE": "SUB_SCAN",
+}
+NUMBERS = {
+    "ANTENNA": "DISH_DIAMETER", "FEED": "INTERVAL TIME", "FIELD": "TIME", "OBSERVATION": "RELEASE_DATE",
+    "POINTING": "INTERVAL TIME", "SOURCE": "INTERVAL TIME", "SPECTRAL_WINDOW": "REF_FREQUENCY TOTAL_BANDWIDTH", "STATE": "CAL LOAD",
+}
+ARRAYS = {
+    "ANTENNA": "OFFSET POSITION", "FEED": "BEAM_OFFSET POL_RESPONSE POSITION RECEPTOR_ANGLE",
+    "FIELD": "DELAY_DIR PHASE_DIR REFERENCE_DIR",
+    "OBSERVATION": "TIME_RANGE", "POINTING": "DIRECTION TARGET", "POLARIZATION": "CORR_PRODUCT CORR_TYPE",
+    "SOURCE": "DIRECTION PROPER_MOTION REST_FREQUENCY SYSVEL",
+    "SPECTRAL_WINDOW": "CHAN_FREQ CHAN_WIDTH EFFECTIVE_BW RESOLUTION",
+}
+REQUIRED = ("ANTENNA", "DATA_DESCRIPTION", "FEED", "FIELD", "FLAG_CMD", "HISTORY", "OBSERVATION", "POINTING", "POLARIZATION",
+            "PROCESSOR", "SPECTRAL_WINDOW", "STATE")
+UNUSED = "unused row"
+
+
+def subtable_cases():
+    """Return the ways in which the subtables are spoiled: in their first row, and in one that no data refer to."""
+    cases = {}
+    for table in sorted({*REQUIRED, *TEXTS, *ARRAYS}):
+        every = [cells for kind in (TEXTS, INTEGERS, NUMBERS, ARRAYS) for cells in kind.get(table, "").split()]
+        cases |= {f"{table} gone": lambda name, table=table: shutil.rmtree(f"{name}/{table}"),
+                  f"{table} without rows": rows_of(table, lambda tb: tb.removerows(list(range(tb.nrows())))),
+                  f"{table} without its last row": rows_of(table, lambda tb: tb.nrows() and tb.removerows([tb.nrows() - 1])),
+                  f"{table} with an empty row, an {UNUSED}": rows_of(table, lambda tb: tb.addrows(1))}
+        cases |= {f"{table}/{col} gone": within(table, lacking(col)) for col in every}
+        cases |= {f"{table}/{col} of type {kind}": within(table, remake(col, _as_type(kind), valueType=kind))
+                  for cols, kind in ((INTEGERS, "double"), (INTEGERS, "string"), (NUMBERS, "float"), (NUMBERS, "string"),
+                                     (ARRAYS, "float"), (ARRAYS, "string")) for col in cols.get(table, "").split()}
+        cases |= {f"{table}/{col} of type int": within(table, remake(col, lambda old: [0] * len(old), valueType="int"))
+                  for col in TEXTS.get(table, "").split()}
+        for where in ("first row", UNUSED):
+            cases |= {f"{table}/{col} {words} in an {where}".replace("an first", "the first"): spoil
+                      for col in every for words, spoil in ways(table, col, where == UNUSED)}
+    return cases
+
+
+def ways(table, col, unused):
+    """Yield how a cell of the first row is spoiled, or of a row that no data refer to: words, and what spoils."""
+    if col in TEXTS.get(table, "").split():
+        changes = {"with a Latin-1 byte": "J\u00fcrgen", "empty": "", "long": "x" * 5000, "with a line break": "a\nb"}
+    elif col in INTEGERS.get(table, "").split():
+        changes = {f"{value}": value for value in (-1, -2, 99, 2**31 - 1)}
+    elif col in NUMBERS.get(table, "").split():
+        changes = {f"{value}": value for value in (np.nan, np.inf, -1.0, 0.0, 1e300)}
+    else:
+        changes = {"undefined": lambda cell: None, "of no size": lambda cell: cell[..., :0], "zero": lambda cell: cell * 0,
+                   "longer": lambda cell: np.concatenate([cell, cell], axis=-1), "negative": lambda cell: -abs(cell) - 1,
+                   "of an axis more": lambda cell: cell[None],
+                   "NaN": lambda cell: cell * 0 - 1 if cell.dtype.kind == "i" else cell * np.nan}
+    for words, change in changes.items():
+        yield words, within(table, _cell(col, change, unused))
+
+
+def _cell(col, change, unused):
+    """Return a function that changes one cell of a subtable: the first, or that of a row more."""
+
+    def spoil(name):
+        tb = casatools.table()
+        tb.open(name, nomodify=False)
+        try:
+            if unused and tb.nrows():
+                tb.copyrows(name, startrowin=0, startrowout=-1, nrow=1)
+            elif not tb.nrows():
+                tb.addrows(1)
+            row = tb.nrows() - 1 if unused else 0
+            if not callable(change):
+                part = tb.selectrows([row])
+                part.putcol(col, np.array([change]))  # text by bytes, not as UTF-8
+                part.close()
+                return
+        finally:
+            tb.close()
+        cells(col, [row], change, ndim=-1)(name)
+
+    return spoil
+
+
+def within(table, spoil):
+    """Return a function that spoils a subtable as `spoil` does a table."""
+    return lambda name: spoil(f"{name}/{table}")
+
+
+def rows_of(table, change):
+    """Return a function that changes the rows of a subtable."""
+
+    def spoil(name):
+        tb = casatools.table()
+        tb.open(f"{name}/{table}", nomodify=False)
+        try:
+            change(tb)
+        finally:
+            tb.close()
+
+    return spoil
+
+
+TABLES = {"main": main_cases, "subtables": subtable_cases}
 
 
 # One process, many cases -------------------------------------------------------------------------

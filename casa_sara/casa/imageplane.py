@@ -68,7 +68,8 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
     """Return the image plane that tclean makes of this selection and grid.
 
     As in tclean, the MeasurementSet that begins first gives the date, the observer and the
-    source's name. Where CASA has no primary beam of the telescope, it is 1 everywhere. Nothing is written to the MeasurementSets, and no files are left behind.
+    source's name. Where CASA has no primary beam of the telescope, it is 1 everywhere. Nothing is
+    written to the MeasurementSets, and no files are left behind.
 
     Parameters
     ----------
@@ -202,7 +203,8 @@ def _selection_record(selection, number, diameters=False):
 
     name = selection.vis[number]
     chosen = dict.fromkeys(("field", "spw", "timestr", "uvdist", "antenna", "scan", "obs", "state"), "")
-    chosen |= {_SELECTDATA_KEYS.get(parameter, parameter): value for parameter, value in for_parser(name, selection.of(number)).items()}
+    strings = for_parser(name, selection.of(number))
+    chosen |= {_SELECTDATA_KEYS.get(parameter, parameter): value for parameter, value in strings.items()}
     chosen |= {"msname": readable(name, diameters), "datacolumn": selection.datacolumn, "savemodel": "none"}
     utils = casatools.synthesisutils()
     try:

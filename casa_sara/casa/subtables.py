@@ -1,15 +1,16 @@
 """The subtables of a MeasurementSet: what is wrong in them, and a copy that CASA survives.
 
 One number that is none, one empty cell or one letter that is not UTF-8, be it in a row that no data refer to, and CASA
-refuses the whole MeasurementSet, never returns, or ends the process. The table tool reads all of them, so the subtables are looked at
-here first. Where something is wrong, CASA's other tools are shown a folder in its place, with links to the files of the
-MeasurementSet and a copy of the subtables that are wrong, set right. What the image depends on is refused
+refuses the whole MeasurementSet, never returns, or ends the process. The table tool reads all of them, so the subtables are
+looked at here first. Where something is wrong, CASA's other tools are shown a folder in its place, with links to the files
+of the MeasurementSet and a copy of the subtables that are wrong, set right. What the image depends on is refused
 when selected data refer to it; the MeasurementSet stays as it is.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -22,26 +23,39 @@ from casa_sara.casa.tools import opened
 
 __all__ = ["check_rows", "readable", "texts"]
 
-_COLUMNS = {  # of the subtables that are read: type and number of axes → names
-    "ANTENNA": {"string": "MOUNT NAME STATION TYPE", "double": "DISH_DIAMETER", "double 1": "OFFSET POSITION",
+_COLUMNS = {  # that CASA wants in the subtables: type, and 'arrays' → names
+    "ANTENNA": {"string": "MOUNT NAME STATION TYPE", "double": "DISH_DIAMETER", "double arrays": "OFFSET POSITION",
                 "boolean": "FLAG_ROW"},
     "DATA_DESCRIPTION": {"int": "POLARIZATION_ID SPECTRAL_WINDOW_ID", "boolean": "FLAG_ROW"},
     "FIELD": {"string": "CODE NAME", "int": "NUM_POLY SOURCE_ID", "double": "TIME",
-              "double 2": "DELAY_DIR PHASE_DIR REFERENCE_DIR", "boolean": "FLAG_ROW"},
-    "OBSERVATION": {"string": "OBSERVER PROJECT SCHEDULE_TYPE TELESCOPE_NAME", "string 1": "LOG SCHEDULE",
-                    "double": "RELEASE_DATE", "double 1": "TIME_RANGE", "boolean": "FLAG_ROW"},
-    "POLARIZATION": {"int": "NUM_CORR", "int 1": "CORR_TYPE", "int 2": "CORR_PRODUCT", "boolean": "FLAG_ROW"},
-    "SPECTRAL_WINDOW": {"string": "FREQ_GROUP_NAME NAME", "int": "FREQ_GROUP IF_CONV_CHAIN MEAS_FREQ_REF NET_SIDEBAND NUM_CHAN",
-                        "double": "REF_FREQUENCY TOTAL_BANDWIDTH", "double 1": "CHAN_FREQ CHAN_WIDTH EFFECTIVE_BW RESOLUTION",
+              "double arrays": "DELAY_DIR PHASE_DIR REFERENCE_DIR", "boolean": "FLAG_ROW"},
+    "OBSERVATION": {"string": "OBSERVER PROJECT SCHEDULE_TYPE TELESCOPE_NAME", "string arrays": "LOG SCHEDULE",
+                    "double": "RELEASE_DATE", "double arrays": "TIME_RANGE", "boolean": "FLAG_ROW"},
+    "POLARIZATION": {"int": "NUM_CORR", "int arrays": "CORR_PRODUCT CORR_TYPE", "boolean": "FLAG_ROW"},
+    "SPECTRAL_WINDOW": {"string": "FREQ_GROUP_NAME NAME",
+                        "int": "FREQ_GROUP IF_CONV_CHAIN MEAS_FREQ_REF NET_SIDEBAND NUM_CHAN",
+                        "double": "REF_FREQUENCY TOTAL_BANDWIDTH",
+                        "double arrays": "CHAN_FREQ CHAN_WIDTH EFFECTIVE_BW RESOLUTION",
                         "boolean": "FLAG_ROW"},
     "STATE": {"string": "OBS_MODE", "int": "SUB_SCAN", "double": "CAL LOAD", "boolean": "FLAG_ROW REF SIG"},
     "SOURCE": {"string": "CODE NAME", "int": "CALIBRATION_GROUP NUM_LINES SOURCE_ID SPECTRAL_WINDOW_ID",
-               "double": "INTERVAL TIME", "double 1": "DIRECTION PROPER_MOTION"},
+               "double": "INTERVAL TIME", "double arrays": "DIRECTION PROPER_MOTION"},
+    "FEED": {"int": "ANTENNA_ID BEAM_ID FEED_ID NUM_RECEPTORS SPECTRAL_WINDOW_ID", "double": "INTERVAL TIME",
+             "double arrays": "BEAM_OFFSET POSITION RECEPTOR_ANGLE", "complex arrays": "POL_RESPONSE",
+             "string arrays": "POLARIZATION_TYPE"},
+    "FLAG_CMD": {"string": "COMMAND REASON TYPE", "int": "LEVEL SEVERITY", "double": "INTERVAL TIME", "boolean": "APPLIED"},
+    "HISTORY": {"string": "APPLICATION MESSAGE ORIGIN PRIORITY", "string arrays": "APP_PARAMS CLI_COMMAND",
+                "int": "OBJECT_ID OBSERVATION_ID", "double": "TIME"},
+    "POINTING": {"string": "NAME", "int": "ANTENNA_ID NUM_POLY", "double": "INTERVAL TIME TIME_ORIGIN",
+                 "double arrays": "DIRECTION TARGET", "boolean": "TRACKING"},
+    "PROCESSOR": {"string": "SUB_TYPE TYPE", "int": "MODE_ID TYPE_ID", "boolean": "FLAG_ROW"},
 }
 _OPTIONAL = {"SOURCE"}
+_UNREAD = {"FEED", "FLAG_CMD", "HISTORY", "POINTING", "PROCESSOR"}  # may be long, and no image depends on them
 _FREQUENCY_FRAMES = {*range(9), 64}  # REST to CMB, and Undefined
 _LAST_CORRELATION = 32
 _DIAMETER_M = 25.0
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class _Rule(NamedTuple):
@@ -205,12 +219,15 @@ def texts(name, table, column):
 
 def _decoded(text):
     """Return a text as it was meant, given with one character for each byte, as `getcol` does."""
-    if text.isascii():
-        return text
     try:
-        return text.encode("latin-1").decode("utf-8")
+        return text if text.isascii() else text.encode("latin-1").decode("utf-8")
     except UnicodeError:
         return text
+
+
+def _bearable(text):
+    """Return a text, given with one character for each byte, as CASA bears it: UTF-8 without control characters."""
+    return text if text.isascii() and text.isprintable() else _CONTROL.sub(" ", _decoded(text))
 
 
 def _subtables(name):
@@ -236,12 +253,15 @@ def _state(name):
 def _examined(name):
     """Examine all subtables, and make a copy of those that are wrong."""
     found, counts = _Subtables(name), {}
-    tables = [table for table in _COLUMNS if table not in _OPTIONAL or os.path.isdir(os.path.join(name, table))]
+    with opened("table", name) as tb:
+        tables = [table for table in _COLUMNS if table not in _OPTIONAL or table in tb.keywordnames()]
     for table in tables:
+        if not os.path.isdir(os.path.join(name, table)):
+            raise ValueError(f"vis = '{name}' has no subtable {table}: it is no MeasurementSet without")
         with opened("table", os.path.join(name, table)) as tb:
             _check_columns(name, table, tb)
             counts[table] = tb.nrows()
-    for table in tables:
+    for table in (table for table in tables if table not in _UNREAD):
         with opened("table", os.path.join(name, table)) as tb:
             _examine(found, table, tb, counts)
     return found
@@ -251,21 +271,20 @@ def _check_columns(name, table, tb):
     """Raise unless the columns of a subtable are there, of the right type."""
     described = tb.getdesc()
     for kind, columns in _COLUMNS[table].items():
-        right, _, axes = kind.partition(" ")
         for column in columns.split():
             if column not in described:
                 raise ValueError(f"vis = '{name}': {table} has no column {column}: it is no MeasurementSet without")
             one = described[column]
-            if one["valueType"].lower() != right or bool(axes) != ("ndim" in one):
-                held = one["valueType"] + (" arrays" if "ndim" in one else "")
-                raise ValueError(f"vis = '{name}': {table}/{column} holds {held}: should be {right}"
-                                 + (" arrays" if axes else ""))
+            held = one["valueType"].lower() + (" arrays" if "ndim" in one else "")
+            if held != kind:
+                raise ValueError(f"vis = '{name}': {table}/{column} holds {held}: should be {kind}")
 
 
 def _examine(found, table, tb, counts):
     """Note the wrong cells of one subtable, and what to put in their places."""
-    repairs = [(column, row, text) for column in _COLUMNS[table].get("string", "").split()
-               for row, text in enumerate(tb.getcol(column)) if not _is_utf8(text)]
+    texts_of = {column: tb.getcol(column) for column in _COLUMNS[table].get("string", "").split()}
+    repairs = [(column, row, _bearable(text)) for column, cells in texts_of.items()
+               for row, text in enumerate(cells) if _bearable(text).encode() != text.encode("latin-1")]
     rules = _RULES.get(table, ())
     cells = {rule.column: _cells(tb, rule.column) for rule in rules}
     rows = [{column: cells[column][row] for column in cells} for row in range(tb.nrows())]
@@ -295,11 +314,6 @@ def _cells(tb, column):
 def _is_right(rule, row, counts):
     cell = row[rule.column]
     return cell is not None and bool(np.all(rule.right(cell, row, counts)))
-
-
-def _is_utf8(text):
-    """Return whether a text, given with one character for each byte, is UTF-8."""
-    return text.isascii() or _decoded(text) is not text
 
 
 def _spelled(cell):
