@@ -8,7 +8,7 @@ begins; when it dies or hangs, that case is counted and another process goes on 
 
     as untouched    the image of the MeasurementSet as it was: what was spoiled does not matter
     without rows    the image of it with the spoiled rows flagged
-    clear error     an error that names vis (or datacolumn) and the spoiled column or subtable
+    clear error     an error that names vis (or datacolumn) and the spoiled column or subtable, not in CASA's words
 
 and wrong ones "wrong image", "bare error", "changed" (the MeasurementSet is not the same afterwards), "signal" and "hang".
 """
@@ -254,7 +254,7 @@ def attempt(spoil, mode, references, words):
     if mode != "modelcolumn" and hashes("spoiled.ms", "table.lock") != before:
         return "changed", said
     if made is None:
-        named = ("vis = " in said or "datacolumn = " in said) and any(word in said for word in words)
+        named = any(word in said for word in ("vis = ", "vis: ", "datacolumn = ")) and any(word in said for word in words)
         return "clear error" if named and "cannot be read" not in said else "bare error", said
     off = {outcome: np.abs(made - one).max() / np.abs(one).max() for outcome, one in references.items() if one.shape == made.shape}
     closest = min(off, key=off.get, default="")

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from casa_sara.casa.cells import first_misfit
 from casa_sara.casa.subtables import readable
 from casa_sara.casa.tools import opened
 
@@ -14,6 +15,17 @@ __all__ = ["check_measurement_set", "reading"]
 
 _LATEST_S = 1e11  # MJD seconds, in the year 5000
 _NEEDED = {"UVW", "ANTENNA1", "DATA_DESC_ID", "FLAG"}
+# of the main table, as CASA asks for them: type → columns; those with axes
+_REQUIRED = {
+    "int": ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "DATA_DESC_ID", "FEED1", "FEED2", "FIELD_ID", "OBSERVATION_ID", "PROCESSOR_ID",
+            "SCAN_NUMBER", "STATE_ID"),
+    "double": ("EXPOSURE", "INTERVAL", "TIME", "TIME_CENTROID", "UVW"),
+    "boolean": ("FLAG", "FLAG_CATEGORY", "FLAG_ROW"),
+    "float": ("SIGMA", "WEIGHT"),
+}
+_OPTIONAL = {"complex": ("DATA", "CORRECTED_DATA", "MODEL_DATA"), "float": ("WEIGHT_SPECTRUM", "SIGMA_SPECTRUM")}
+_ARRAYS = {"UVW", "FLAG", "FLAG_CATEGORY", "SIGMA", "WEIGHT"} | {name for names in _OPTIONAL.values() for name in names}
+_IDENTIFIERS = {"ANTENNA1": "ANTENNA", "ANTENNA2": "ANTENNA", "DATA_DESC_ID": "DATA_DESCRIPTION", "OBSERVATION_ID": "OBSERVATION"}
 
 
 @contextmanager
@@ -22,8 +34,7 @@ def reading(name):
     try:
         yield
     except (RuntimeError, UnicodeDecodeError, SystemError) as error:
-        words = " ".join(str(error).split())
-        raise ValueError(f"vis = '{name}' cannot be read: {words}") from error
+        raise ValueError(f"vis = '{name}' cannot be read: {' '.join(str(error).split())}") from error
 
 
 def check_measurement_set(name):
@@ -54,8 +65,41 @@ def check_measurement_set(name):
         raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet")
     if rows == 0:
         raise ValueError(f"vis = '{name}' is a MeasurementSet without rows")
-    with reading(name):
+    with reading(name), opened("table", name) as tb:
+        _check_columns(tb, name)
         _check_numbers(name)
+        _check_identifiers(tb, name)
+
+
+def _check_columns(tb, name):
+    """Raise unless the columns of the main table are what CASA asks of a MeasurementSet."""
+    there = tb.getdesc()
+    for kind, column in [(kind, one) for kinds in (_REQUIRED, _OPTIONAL) for kind, names in kinds.items() for one in names]:
+        if column not in there:
+            if column in _REQUIRED.get(kind, ()):
+                raise ValueError(f"vis = '{name}' has no column {column}, which every MeasurementSet has")
+            continue
+        right = f"{kind}, in arrays" if column in _ARRAYS else kind
+        found = there[column]["valueType"] + (", in arrays" if "ndim" in there[column] else "")
+        if found != right:
+            raise ValueError(f"vis = '{name}': {column} holds values of type {found}: should be {right}")
+    misfit = first_misfit(tb, "UVW", (3,))
+    if misfit:
+        raise ValueError(f"vis = '{name}': {misfit}")
+
+
+def _check_identifiers(tb, name):
+    """Raise on numbers of antennas, data descriptions and observations that the subtables do not have."""
+    counts = {}
+    for subtable in set(_IDENTIFIERS.values()):
+        with opened("table", os.path.join(name, subtable)) as of_subtable:
+            counts[subtable] = of_subtable.nrows()
+    for column, subtable in _IDENTIFIERS.items():
+        values = tb.getcol(column)
+        right = (values >= 0) & (values < counts[subtable])
+        if not right.all():
+            row = int(np.argmin(right))
+            _check(name, column, row, values[row], right[row], f"a row of {subtable}, 0 to {counts[subtable] - 1}")
 
 
 def _check_numbers(name):

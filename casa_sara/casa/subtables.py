@@ -257,7 +257,7 @@ def _examined(name):
         tables = [table for table in _COLUMNS if table not in _OPTIONAL or table in tb.keywordnames()]
     for table in tables:
         if not os.path.isdir(os.path.join(name, table)):
-            raise ValueError(f"vis = '{name}' has no subtable {table}: it is no MeasurementSet without")
+            raise ValueError(f"vis = '{name}': the subtable {table} is missing")
         with opened("table", os.path.join(name, table)) as tb:
             _check_columns(name, table, tb)
             counts[table] = tb.nrows()
@@ -273,7 +273,7 @@ def _check_columns(name, table, tb):
     for kind, columns in _COLUMNS[table].items():
         for column in columns.split():
             if column not in described:
-                raise ValueError(f"vis = '{name}': {table} has no column {column}: it is no MeasurementSet without")
+                raise ValueError(f"vis = '{name}': {table} has no column {column}, which every MeasurementSet has")
             one = described[column]
             held = one["valueType"].lower() + (" arrays" if "ndim" in one else "")
             if held != kind:

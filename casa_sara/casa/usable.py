@@ -32,7 +32,8 @@ class Usability:
     def __call__(self, chunk):
         """Return the bool (R, C) of samples to keep of R rows and C channels, and count the others.
 
-        Beside flags and numbers that are none, these are left out: weights beyond single precision or 1e6 times the
+        Beside flags, cells that are not there and numbers that are none, these are left out: weights beyond single
+        precision or 1e6 times the
         median; data beyond single precision, or 1e9 times their noise and 1e6 times the median (in units of the
         noise); baselines of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
         """
@@ -40,6 +41,8 @@ class Usability:
         weights = chunk.weight if chunk.parallel is chunk.weight else [*chunk.weight, *chunk.parallel]
         self._leave_out(ok, "autocorrelation", (chunk.columns["antenna1"] == chunk.columns["antenna2"])[:, None])
         self._leave_out(ok, "flagged row", chunk.flag_row[:, None])
+        for column, rows in chunk.undefined.items():
+            self._leave_out(ok, f"undefined {column}", rows[:, None])
         self._leave_out(ok, "flagged", chunk.flag)
         self._leave_out(ok, "non-finite data", ~np.all([np.isfinite(hand) for hand in chunk.vis], axis=0))
         self._leave_out(ok, "non-finite weight", ~np.all([np.isfinite(hand) for hand in weights], axis=0))

@@ -39,7 +39,7 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     The uv cells are square, of side 1/(field of view) of the larger image side. imager reads
     the selection again, without autocorrelations and flagged rows; the MeasurementSets are
     opened read-only and nothing is written to them. Where samples were left out that no flag
-    told it of, and where its grid cannot be right, because it holds less than the sample
+    told it of, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM, and where its grid cannot be right, because it holds less than the sample
     itself, the samples are counted here.
 
     Parameters
@@ -63,7 +63,7 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     u, v = _field_uv(visibilities, "data")
     cells = _cells(u, v, (side, side), (cell, cell))
     density = np.zeros(visibilities.size, np.float32)
-    if selection is not None and visibilities.dropped.keys() <= set(IN_FLAGS):
+    if selection is not None and not visibilities.mixed_weights and visibilities.dropped.keys() <= set(IN_FLAGS):
         for number in np.unique(np.concatenate(comm.gather(np.unique(visibilities.rows.ms)))):
             try:
                 density += comm.once(_imager_grid, visibilities.ms_names[number], selection.of(number), side, cell)[cells]
