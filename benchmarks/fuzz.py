@@ -1,6 +1,6 @@
 """What tsara makes of MeasurementSets with one column of one table spoiled, counted by outcome.
 
-    python benchmarks/fuzz.py [--tables main] [--mode mfs] [--verbose] [WORDS]
+    python benchmarks/fuzz.py [--tables main subtables] [--mode mfs] [--verbose] [WORDS]
 
 spoils a small MeasurementSet in every way of `TABLES` whose name holds WORDS (a cell empty, of another shape or type, not a
 number, an identifier out of range, a column gone, …) and runs tsara on it. Many cases share one process, which says what it
@@ -125,7 +125,8 @@ INTEGERS = {
 }
 NUMBERS = {
     "ANTENNA": "DISH_DIAMETER", "FEED": "INTERVAL TIME", "FIELD": "TIME", "OBSERVATION": "RELEASE_DATE",
-    "POINTING": "INTERVAL TIME", "SOURCE": "INTERVAL TIME", "SPECTRAL_WINDOW": "REF_FREQUENCY TOTAL_BANDWIDTH", "STATE": "CAL LOAD",
+    "POINTING": "INTERVAL TIME", "SOURCE": "INTERVAL TIME", "SPECTRAL_WINDOW": "REF_FREQUENCY TOTAL_BANDWIDTH",
+    "STATE": "CAL LOAD",
 }
 ARRAYS = {
     "ANTENNA": "OFFSET POSITION", "FEED": "BEAM_OFFSET POL_RESPONSE POSITION RECEPTOR_ANGLE",

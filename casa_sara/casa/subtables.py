@@ -39,7 +39,7 @@ _COLUMNS = {  # that CASA wants in the subtables: type, and 'arrays' → names
                         "boolean": "FLAG_ROW"},
     "STATE": {"string": "OBS_MODE", "int": "SUB_SCAN", "double": "CAL LOAD", "boolean": "FLAG_ROW REF SIG"},
     "SOURCE": {"string": "CODE NAME", "int": "CALIBRATION_GROUP NUM_LINES SOURCE_ID SPECTRAL_WINDOW_ID",
-               "double": "INTERVAL TIME", "double arrays": "DIRECTION PROPER_MOTION"},
+               "double": "INTERVAL TIME", "double arrays": "DIRECTION PROPER_MOTION REST_FREQUENCY SYSVEL"},
     "FEED": {"int": "ANTENNA_ID BEAM_ID FEED_ID NUM_RECEPTORS SPECTRAL_WINDOW_ID", "double": "INTERVAL TIME",
              "double arrays": "BEAM_OFFSET POSITION RECEPTOR_ANGLE", "complex arrays": "POL_RESPONSE",
              "string arrays": "POLARIZATION_TYPE"},
@@ -51,6 +51,7 @@ _COLUMNS = {  # that CASA wants in the subtables: type, and 'arrays' → names
     "PROCESSOR": {"string": "SUB_TYPE TYPE", "int": "MODE_ID TYPE_ID", "boolean": "FLAG_ROW"},
 }
 _OPTIONAL = {"SOURCE"}
+_OPTIONAL_COLUMNS = {"REST_FREQUENCY", "SYSVEL"}  # cells may be empty, too
 _UNREAD = {"FEED", "FLAG_CMD", "HISTORY", "POINTING", "PROCESSOR"}  # may be long, and no image depends on them
 _FREQUENCY_FRAMES = {*range(9), 64}  # REST to CMB, and Undefined
 _LAST_CORRELATION = 32
@@ -62,7 +63,8 @@ class _Rule(NamedTuple):
     """What a cell should hold: `right` takes the cell, the others of its row by name and the numbers of rows by subtable.
 
     `instead` takes the others of its row and returns what stands for a wrong cell, which the image does not depend on.
-    Without it a wrong cell is refused when selected data refer to it, and stands elsewhere for the cell of a row that is right.
+    Without it a wrong cell is refused when selected data refer to it, and elsewhere the cell of a row that is right stands
+    for it.
     """
 
     column: str
@@ -136,6 +138,9 @@ _RULES = {
         _Rule("PROPER_MOTION", "", _numbers(2), lambda row: np.zeros(2)),
         _Rule("TIME", "", _numbers(), lambda row: np.zeros(())),
         _Rule("INTERVAL", "", _numbers(), lambda row: np.zeros(())),
+        _Rule("REST_FREQUENCY", "", lambda cell, row, counts: cell.ndim == 1 and np.isfinite(cell) & (cell > 0),
+              lambda row: np.zeros(0)),
+        _Rule("SYSVEL", "", lambda cell, row, counts: cell.ndim == 1 and np.isfinite(cell), lambda row: np.zeros(0)),
     ),
 }
 
@@ -273,6 +278,8 @@ def _check_columns(name, table, tb):
     for kind, columns in _COLUMNS[table].items():
         for column in columns.split():
             if column not in described:
+                if column in _OPTIONAL_COLUMNS:
+                    continue
                 raise ValueError(f"vis = '{name}': {table} has no column {column}, which every MeasurementSet has")
             one = described[column]
             held = one["valueType"].lower() + (" arrays" if "ndim" in one else "")
@@ -285,7 +292,7 @@ def _examine(found, table, tb, counts):
     texts_of = {column: tb.getcol(column) for column in _COLUMNS[table].get("string", "").split()}
     repairs = [(column, row, _bearable(text)) for column, cells in texts_of.items()
                for row, text in enumerate(cells) if _bearable(text).encode() != text.encode("latin-1")]
-    rules = _RULES.get(table, ())
+    rules = [rule for rule in _RULES.get(table, ()) if rule.column in tb.colnames()]
     cells = {rule.column: _cells(tb, rule.column) for rule in rules}
     rows = [{column: cells[column][row] for column in cells} for row in range(tb.nrows())]
     needed, others = [[rule for rule in rules if (rule.instead is None) == bare] for bare in (True, False)]
@@ -313,7 +320,9 @@ def _cells(tb, column):
 
 def _is_right(rule, row, counts):
     cell = row[rule.column]
-    return cell is not None and bool(np.all(rule.right(cell, row, counts)))
+    if cell is None:
+        return rule.column in _OPTIONAL_COLUMNS
+    return bool(np.all(rule.right(cell, row, counts)))
 
 
 def _spelled(cell):

@@ -105,6 +105,7 @@ UNTOUCHED = {  # name: what spoils; the image is that of the MeasurementSet as i
         ("ANTENNA", "POSITION", np.nan), ("DATA_DESCRIPTION", "SPECTRAL_WINDOW_ID", -1), ("FIELD", "PHASE_DIR", np.nan),
         ("POLARIZATION", "CORR_TYPE", 0), ("SPECTRAL_WINDOW", "CHAN_FREQ", np.nan), ("SPECTRAL_WINDOW", "NUM_CHAN", 7),
         ("SOURCE", "DIRECTION", np.nan))},
+    "REST_FREQUENCY NaN": first("SOURCE", "REST_FREQUENCY", lambda cell: np.array([np.nan])),
     **{f"{table}/{col} undefined": first(table, col, lambda cell: None) for table, col in (
         ("ANTENNA", "OFFSET"), ("FIELD", "DELAY_DIR"), ("FIELD", "REFERENCE_DIR"), ("OBSERVATION", "TIME_RANGE"),
         ("POLARIZATION", "CORR_PRODUCT"), ("SPECTRAL_WINDOW", "EFFECTIVE_BW"), ("SPECTRAL_WINDOW", "RESOLUTION"))},
