@@ -276,6 +276,7 @@ class _Observed:
         notes.extend(data.notes)
         self._gridder = _common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)
+        notes.extend(image_plane.notes)
         self.plane, self._data, self._nthreads = SkyPlane(image_plane.csys, plane.shape), data, request.nthreads
         self._operators = {}
         operator = self._operator(self.plane, "models")

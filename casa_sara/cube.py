@@ -162,6 +162,7 @@ class _Cube:
     def of(cls, request, data, planes):
         """Lay out the axis and sort the samples by channel; there are no images yet."""
         plane = define_image_plane(data, request.selection, request.grid, request.output.pblimit, planes)
+        data.notes.extend(plane.notes)
         if not plane.mask.any():
             data.notes.append(nowhere_visible(request.grid, request.output))
         axis = SpectralAxis.of(plane)

@@ -181,6 +181,7 @@ def _read(selection, grid, output, crew):
     data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), crew)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, selection, grid, output.pblimit)
+    data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
     _caution(data)

@@ -69,6 +69,8 @@ class Visibilities:
         Name of the telescope, of the first row selected.
     freq_hz : float32 (M,) or None
         LSRK frequencies, where they were asked for.
+    mixed_weights : bool
+        Whether some rows of a MeasurementSet have a WEIGHT_SPECTRUM and others have not.
     """
 
     vis: np.ndarray
@@ -87,6 +89,7 @@ class Visibilities:
     spws: dict[int, tuple[int, ...]] = field(default_factory=dict)
     observatory: str = ""
     freq_hz: np.ndarray | None = None
+    mixed_weights: bool = False
 
     @property
     def size(self) -> int:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from casa_sara.casa.cells import read_slice
 from casa_sara.casa.frames import SPEED_OF_LIGHT
 from casa_sara.casa.selection import select_data
 from casa_sara.casa.tools import opened
@@ -75,9 +76,10 @@ def _unflagged(tb, rows, group):
     low, high = [0, int(first)], [len(group.correlations) - 1, int(group.channels[-1])]
     step = max(1, _CHUNK // (int(np.ptp(group.channels) + 1) * len(group.correlations)))
     for start in range(0, rows.size, step):
-        part = tb.selectrows(rows[start : start + step].tolist())
+        some = rows[start : start + step]
+        part = tb.selectrows(some.tolist())
         try:
-            flag = np.any(part.getcolslice("FLAG", low, high, [1, 1]), axis=0)[group.channels - first]
+            flag = np.any(read_slice(part, "FLAG", group.has("FLAG", some), low, high, bool), axis=0)[group.channels - first]
             count += np.count_nonzero(~(flag | part.getcol("FLAG_ROW")))
         finally:
             part.close()

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.casa.subtables import check_rows, readable
 from casa_sara.casa.tools import opened
 
 __all__ = ["Geometry", "direction_measure", "image_basis", "image_direction", "is_of_earth", "on_sky",
@@ -130,9 +131,10 @@ def direction_measure(frame, longitude, latitude):
 
 def _field_direction(field, ms):
     """Return the phase centre of any field of this MeasurementSet, selected or not."""
-    with opened("msmetadata", ms.name) as md:
+    with opened("msmetadata", readable(ms.name)) as md:
         if field >= md.nfields():
             raise ValueError(f"phasecenter = {field}: '{ms.name}' has the fields 0 to {md.nfields() - 1}")
+        check_rows(ms.name, FIELD=[field])
         return md.phasecenter(field)
 
 

@@ -6,14 +6,16 @@ CASA's own synthesisimager makes them from the selected data, so they are tclean
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from casa_sara.casa.frames import image_basis, unit_vectors
 from casa_sara.casa.integrity import reading
+from casa_sara.casa.msselect import for_parser
 from casa_sara.casa.quantities import check_frequency
-from casa_sara.casa.tools import opened, scratch_folder
+from casa_sara.casa.subtables import readable
+from casa_sara.casa.tools import check_handles, made, more_handles, opened, scratch_folder
 
 __all__ = ["ImagePlane", "define_image_plane", "read_pixels", "slabs"]
 
@@ -41,6 +43,8 @@ class ImagePlane:
         Telescope and distance.
     masks_all : bool
         Whether .residual and .image have the mask, or only .pb and what is divided by it.
+    notes : list of str
+        What the user should know of it.
     """
 
     csys: dict
@@ -49,6 +53,7 @@ class ImagePlane:
     imageinfo: dict
     miscinfo: dict
     masks_all: bool = True
+    notes: list[str] = field(default_factory=list)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -65,7 +70,8 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
     """Return the image plane that tclean makes of this selection and grid.
 
     As in tclean, the MeasurementSet that begins first gives the date, the observer and the
-    source's name. Nothing is written to the MeasurementSets, and no files are left behind.
+    source's name. Where CASA has no primary beam of the telescope, it is 1 everywhere. Nothing is
+    written to the MeasurementSets, and no files are left behind.
 
     Parameters
     ----------
@@ -92,19 +98,34 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
         check_frequency(grid.reffreq, "reffreq")
     with scratch_folder((*grid.shape, channels)) as folder:
         root = os.path.join(folder, "plane")
-        _make_primary_beam(visibilities, selection, grid, root)
-        with opened("image", root + ".pb") as ia:
+        with more_handles(selection.vis):
+            known = _make_primary_beam(visibilities, selection, grid, root)
+            if not known:  # for the coordinates
+                _make_primary_beam(visibilities, selection, grid, root, diameters=True)
+        path = made(root + ".pb", f"vis = {list(selection.vis)}")
+        with opened("image", path) as ia:
             pb = _read_planes(ia) if grid.is_cube else read_pixels(ia)
             csys, miscinfo = ia.coordsys().torecord(), ia.miscinfo()
-        with opened("table", root + ".pb") as tb:
+        with opened("table", path) as tb:
             imageinfo = tb.getkeyword("imageinfo")
     _check_coordinates(csys, visibilities.phase_center, grid)
+    notes = []
+    if not known:
+        notes.append(_without_beam(csys["telescope"]))
+        pb[...] = 1
     # above 1 where several fields are imaged together
     pb /= np.maximum(pb.max(axis=(-2, -1), keepdims=True), np.float32(1))
     mask = pb > abs(pblimit)
     pb[~mask] = 0
     kept = {key: miscinfo[key] for key in ("INSTRUME", "distance") if key in miscinfo}
-    return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept, masks_all=bool(pblimit >= 0))
+    return ImagePlane(csys=csys, pb=pb, mask=mask, imageinfo=imageinfo, miscinfo=kept, masks_all=bool(pblimit >= 0),
+                      notes=notes)
+
+
+def _without_beam(telescope):
+    """Say that the primary beam is unknown."""
+    return (f"CASA has no primary beam of the telescope '{telescope}', whose first antenna has no diameter in "
+            "ANTENNA/DISH_DIAMETER: .pb is 1 everywhere, and what is divided by it stays as it is")
 
 
 def _check_coordinates(csys, center, grid):
@@ -161,8 +182,11 @@ def slabs(nx, ny):
     return [slice(start, min(start + step, nx)) for start in range(0, nx, step)]
 
 
-def _make_primary_beam(visibilities, selection, grid, root):
-    """Write the image `root`.pb, not normalised yet, with synthesisimager.
+def _make_primary_beam(visibilities, selection, grid, root, diameters=False):
+    """Write the image `root`.pb, not normalised yet, with synthesisimager, and return whether it could.
+
+    Of a telescope without a model of its beam and without the diameter of its first antenna, CASA makes none unless it is
+    told of `diameters`.
 
     Its partner synthesisnormalizer would do that, but now and then the two tools overwrite
     each other's pixels.
@@ -172,8 +196,9 @@ def _make_primary_beam(visibilities, selection, grid, root):
     imager = casatools.synthesisimager()
     try:
         for number in _by_start(visibilities):
+            check_handles(selection.vis[number], selection.vis)
             with reading(selection.vis[number]):
-                imager.selectdata(_selection_record(selection, number))
+                imager.selectdata(_selection_record(selection, number, diameters))
         try:
             imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
         except RuntimeError as error:
@@ -182,6 +207,7 @@ def _make_primary_beam(visibilities, selection, grid, root):
         imager.makepb()
     finally:
         imager.done()
+    return os.path.exists(root + ".pb")
 
 
 def _axes_words(grid):
@@ -201,13 +227,15 @@ def _by_start(visibilities):
     return sorted(starts, key=starts.get)
 
 
-def _selection_record(selection, number):
+def _selection_record(selection, number, diameters=False):
     """Return one MeasurementSet's selection in synthesisimager's words."""
     import casatools
 
+    name = selection.vis[number]
     chosen = dict.fromkeys(("field", "spw", "timestr", "uvdist", "antenna", "scan", "obs", "state"), "")
-    chosen |= {_SELECTDATA_KEYS.get(parameter, parameter): value for parameter, value in selection.of(number).items()}
-    chosen |= {"msname": selection.vis[number], "datacolumn": selection.datacolumn, "savemodel": "none"}
+    strings = for_parser(name, selection.of(number))
+    chosen |= {_SELECTDATA_KEYS.get(parameter, parameter): value for parameter, value in strings.items()}
+    chosen |= {"msname": readable(name, diameters), "datacolumn": selection.datacolumn, "savemodel": "none"}
     utils = casatools.synthesisutils()
     try:
         return utils.checkselectionparams(chosen)

@@ -7,12 +7,25 @@ from contextlib import contextmanager
 
 import numpy as np
 
+from casa_sara.casa.cells import first_misfit
+from casa_sara.casa.subtables import readable
 from casa_sara.casa.tools import opened
 
 __all__ = ["check_measurement_set", "reading"]
 
 _LATEST_S = 1e11  # MJD seconds, in the year 5000
 _NEEDED = {"UVW", "ANTENNA1", "DATA_DESC_ID", "FLAG"}
+# of the main table, as CASA asks for them: type → columns; those with axes
+_REQUIRED = {
+    "int": ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "DATA_DESC_ID", "FEED1", "FEED2", "FIELD_ID", "OBSERVATION_ID", "PROCESSOR_ID",
+            "SCAN_NUMBER", "STATE_ID"),
+    "double": ("EXPOSURE", "INTERVAL", "TIME", "TIME_CENTROID", "UVW"),
+    "boolean": ("FLAG", "FLAG_CATEGORY", "FLAG_ROW"),
+    "float": ("SIGMA", "WEIGHT"),
+}
+_OPTIONAL = {"complex": ("DATA", "CORRECTED_DATA", "MODEL_DATA"), "float": ("WEIGHT_SPECTRUM", "SIGMA_SPECTRUM")}
+_ARRAYS = {"UVW", "FLAG", "FLAG_CATEGORY", "SIGMA", "WEIGHT"} | {name for names in _OPTIONAL.values() for name in names}
+_IDENTIFIERS = {"ANTENNA1": "ANTENNA", "ANTENNA2": "ANTENNA", "DATA_DESC_ID": "DATA_DESCRIPTION", "OBSERVATION_ID": "OBSERVATION"}
 
 
 @contextmanager
@@ -20,14 +33,15 @@ def reading(name):
     """Turn what CASA and Python say of an unreadable MeasurementSet into a ValueError that names `vis`."""
     try:
         yield
-    except (RuntimeError, UnicodeDecodeError) as error:
+    except (RuntimeError, UnicodeDecodeError, SystemError) as error:
         raise ValueError(f"vis = '{name}' cannot be read: {' '.join(str(error).split())}") from error
 
 
 def check_measurement_set(name):
     """Raise unless `name` is a MeasurementSet with rows, whose numbers CASA survives.
 
-    msmetadata ends the process at a frequency that is no number, and never returns from such a time.
+    msmetadata ends the process at a frequency that is no number, and never returns from such a time. Subtables with
+    something wrong are set right in a copy (:func:`casa_sara.casa.subtables.readable`), or refused where all is wrong.
 
     Raises
     ------
@@ -51,35 +65,58 @@ def check_measurement_set(name):
         raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet")
     if rows == 0:
         raise ValueError(f"vis = '{name}' is a MeasurementSet without rows")
-    with reading(name):
+    with reading(name), opened("table", name) as tb:
+        _check_columns(tb, name)
         _check_numbers(name)
+        _check_identifiers(tb, name)
+
+
+def _check_columns(tb, name):
+    """Raise unless the columns of the main table are what CASA asks of a MeasurementSet."""
+    there = tb.getdesc()
+    for kind, column in [(kind, one) for kinds in (_REQUIRED, _OPTIONAL) for kind, names in kinds.items() for one in names]:
+        if column not in there:
+            if column in _REQUIRED.get(kind, ()):
+                raise ValueError(f"vis = '{name}' has no column {column}, which every MeasurementSet has")
+            continue
+        right = f"{kind}, in arrays" if column in _ARRAYS else kind
+        found = there[column]["valueType"] + (", in arrays" if "ndim" in there[column] else "")
+        if found != right:
+            raise ValueError(f"vis = '{name}': {column} holds values of type {found}: should be {right}")
+    misfit = first_misfit(tb, "UVW", (3,))
+    if misfit:
+        raise ValueError(f"vis = '{name}': {misfit}")
+
+
+def _check_identifiers(tb, name):
+    """Raise on numbers of antennas, data descriptions and observations that the subtables do not have."""
+    counts = {}
+    for subtable in set(_IDENTIFIERS.values()):
+        with opened("table", os.path.join(name, subtable)) as of_subtable:
+            counts[subtable] = of_subtable.nrows()
+    for column, subtable in _IDENTIFIERS.items():
+        values = tb.getcol(column)
+        right = (values >= 0) & (values < counts[subtable])
+        if not right.all():
+            row = int(np.argmin(right))
+            _check(name, column, row, values[row], right[row], f"a row of {subtable}, 0 to {counts[subtable] - 1}")
 
 
 def _check_numbers(name):
-    """Raise on times, fields and frequencies that are none."""
-    fields = _cells(name, "FIELD", "PHASE_DIR")
-    for row, direction in enumerate(fields):
-        _check(name, "FIELD/PHASE_DIR", row, direction, np.isfinite(direction), "finite")
-    for column in ("CHAN_FREQ", "CHAN_WIDTH"):
-        for row, values in enumerate(_cells(name, "SPECTRAL_WINDOW", column)):
-            right = np.isfinite(values) & ((values > 0) if column == "CHAN_FREQ" else (values != 0))
-            _check(name, f"SPECTRAL_WINDOW/{column}", row, values, right, "a frequency in Hz")
+    """Raise on times and fields that are none."""
+    readable(name)
+    with opened("table", os.path.join(name, "FIELD")) as tb:
+        fields = tb.nrows()
     with opened("table", name) as tb:
         time, interval, field = (tb.getcol(column) for column in ("TIME", "INTERVAL", "FIELD_ID"))
     for column, values, right, words in (
         ("TIME", time, (time >= 0) & (time < _LATEST_S), "a time in MJD seconds"),
         ("INTERVAL", interval, np.isfinite(interval), "a number of seconds"),
-        ("FIELD_ID", field, (field >= 0) & (field < len(fields)), f"a row of FIELD, 0 to {len(fields) - 1}"),
+        ("FIELD_ID", field, (field >= 0) & (field < fields), f"a row of FIELD, 0 to {fields - 1}"),
     ):
         if not right.all():
             row = int(np.argmin(right))
             _check(name, column, row, values[row], right[row], words)
-
-
-def _cells(name, subtable, column):
-    """Return the array in every row of one column of a subtable."""
-    with opened("table", os.path.join(name, subtable)) as tb:
-        return [np.asarray(tb.getcell(column, row)) for row in range(tb.nrows())]
 
 
 def _check(name, column, row, values, right, words):

@@ -23,6 +23,7 @@ import numpy as np
 from casa_sara.casa.child import ChildError, in_child
 from casa_sara.casa.frames import Geometry
 from casa_sara.casa.selection import select_data
+from casa_sara.casa.subtables import readable
 from casa_sara.casa.tools import opened
 from casa_sara.interrupt import signals_deferred
 
@@ -87,7 +88,7 @@ def _column_bytes(name):
         if _COLUMN in tb.colnames():
             return 0
         rows = np.bincount(tb.getcol("DATA_DESC_ID"))
-    with opened("msmetadata", name) as md:
+    with opened("msmetadata", readable(name)) as md:
         cells = [
             md.nchan(md.spwfordatadesc(dd)) * len(md.corrtypesforpol(md.polidfordatadesc(dd)))
             for dd in range(rows.size)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from casa_sara.casa.cells import read_slice
 from casa_sara.casa.frames import Geometry, image_direction, is_of_earth, on_sky, separation
 from casa_sara.casa.integrity import reading
 from casa_sara.casa.selection import UNPOLARISED, select_data
@@ -47,9 +48,9 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
 
     A sample is left out when any of its correlations is flagged (cross-hands too, as in tclean), when its row is flagged or
     an autocorrelation, and when data, weights or uvw cannot be used; what was left out is counted by the first reason that
-    applies. Weights are WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the data column (as in tclean). Where one
-    parallel hand has no weight (0, negative or NaN), Stokes I is the other one, with its weight; tclean takes the mean of
-    both there.
+    applies. Weights are, row by row, WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the data column (as in tclean).
+    Where one parallel hand has no weight (0, negative or NaN), Stokes I is the other one, with its weight; tclean takes the
+    mean of both there.
 
     The inverse variance of Re V_I and of Im V_I follows from those of the hands:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
@@ -108,6 +109,8 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
         freq_range_hz=(float(ranges[:, 0].min()), float(ranges[:, 1].max())),
         spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
         observatory=selected[0].observatory,
+        mixed_weights=any(0 < sum(group.has("WEIGHT_SPECTRUM", group.rows).sum() for group in ms.groups)
+                          < sum(group.rows.size for group in ms.groups) for ms in selected),
     )
 
 
@@ -148,7 +151,7 @@ def _pieces(group):
 class _Chunk:
     """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `weighing` tclean's two weights.
 
-    `either` is that of the RowGroup.
+    `either` is that of the RowGroup; `undefined` says of which rows (bool (R,)) a cell of DATA, FLAG or WEIGHT is not there.
     """
 
     rows: np.ndarray
@@ -160,34 +163,38 @@ class _Chunk:
     flag: np.ndarray
     flag_row: np.ndarray
     either: bool
+    undefined: dict[str, np.ndarray]
 
 
 def _chunks(tb, ms, group, pieces):
     """Read the rows of a group in pieces."""
-    weights = _weight_column(tb, group)
     for rows in pieces:
         part = tb.selectrows(rows.tolist())
         try:
-            yield _read(part, rows, ms.column, weights, group)
+            yield _read(part, rows, ms.column, group)
         except RuntimeError as error:
             raise RuntimeError(f"rows {rows[0]} to {rows[-1]}: {error}") from error
         finally:
             part.close()
 
 
-def _read(part, rows, column, weights, group):
+def _read(part, rows, column, group):
     """Read one piece."""
     first = group.channels[0]
     low, high = [0, int(first)], [len(group.correlations) - 1, int(group.channels[-1])]
 
-    def planes(name):
-        return [plane[group.channels - first].T for plane in part.getcolslice(name, low, high, [1, 1])]
+    def planes(name, dtype):
+        cells = read_slice(part, name, group.has(name, rows), low, high, dtype)
+        return [plane[group.channels - first].T for plane in cells]
 
-    if weights == "WEIGHT":
-        weight = [np.broadcast_to(row[:, None], (rows.size, group.channels.size)) for row in part.getcol("WEIGHT")]
-    else:
-        weight = planes(weights)
-    vis, of_hands = planes(column), [weight[hand] for hand in group.hands]
+    spectra = group.has("WEIGHT_SPECTRUM", rows)
+    weight = planes("WEIGHT_SPECTRUM", float)
+    if not spectra.all():
+        of_rows = read_slice(part, "WEIGHT", ~spectra & group.has("WEIGHT", rows), low[:1], high[:1], float)
+        weight = [np.where(spectra[:, None], plane, row[:, None]) for plane, row in zip(weight, of_rows)]
+    vis, of_hands = planes(column, complex), [weight[hand] for hand in group.hands]
+    undefined = {column: ~group.has(column, rows), "FLAG": ~group.has("FLAG", rows),
+                 "WEIGHT": ~spectra & ~group.has("WEIGHT", rows)}
     return _Chunk(
         rows=rows,
         columns={name: part.getcol(of_ms) for name, of_ms in _ROW_COLUMNS.items()},
@@ -195,17 +202,11 @@ def _read(part, rows, column, weights, group):
         vis=[vis[hand] for hand in group.hands],
         weight=of_hands,
         weighing=of_hands if group.weighing == group.hands else [weight[hand] for hand in group.weighing],
-        flag=np.any(planes("FLAG"), axis=0),
+        flag=np.any(planes("FLAG", bool), axis=0),
         flag_row=part.getcol("FLAG_ROW"),
         either=group.either,
+        undefined={name: where for name, where in undefined.items() if where.any()},
     )
-
-
-def _weight_column(tb, group):
-    """Return the column that tclean takes the weights from."""
-    first = int(group.rows[0])
-    filled = "WEIGHT_SPECTRUM" in tb.colnames() and tb.iscelldefined("WEIGHT_SPECTRUM", first)
-    return "WEIGHT_SPECTRUM" if filled and tb.getcell("WEIGHT_SPECTRUM", first).size else "WEIGHT"
 
 
 class _SampleTable:

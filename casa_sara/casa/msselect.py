@@ -7,9 +7,10 @@ import re
 
 import numpy as np
 
+from casa_sara.casa.subtables import readable, texts
 from casa_sara.casa.tools import opened
 
-__all__ = ["MSSELECT_KEYS", "in_words", "msselect"]
+__all__ = ["MSSELECT_KEYS", "for_parser", "in_words", "msselect"]
 
 MSSELECT_KEYS = {
     "field": "field",
@@ -26,6 +27,16 @@ MSSELECT_KEYS = {
 def in_words(strings):
     """Spell a selection for a message."""
     return ", ".join(f"{parameter} = '{value}'" for parameter, value in strings.items()) or "the empty selection"
+
+
+def for_parser(name, strings):
+    """Return a selection with the numbers of those fields whose names the parser does not read: they are not ASCII."""
+    if strings.get("field", "").isascii():
+        return strings
+    names, words = texts(name, "FIELD", "NAME"), []
+    for word in strings["field"].split(","):
+        words += [str(number) for number, one in enumerate(names) if one == word.strip() and not one.isascii()] or [word]
+    return strings | {"field": ",".join(words)}
 
 
 def msselect(name, strings):
@@ -52,7 +63,8 @@ def msselect(name, strings):
     if not strings:
         with opened("table", name) as tb:
             return np.arange(tb.nrows()), {}
-    with opened("ms", name) as tool:
+    strings = for_parser(name, strings)
+    with opened("ms", readable(name)) as tool:
         try:
             understood = tool.msselect({MSSELECT_KEYS[parameter]: value for parameter, value in strings.items()})
         except UnicodeDecodeError:  # the parser cuts its message between the bytes of a letter
@@ -75,7 +87,7 @@ def msselect(name, strings):
 
 def _check_channels(name, spw):
     """Raise on channels beyond the last: the parser would take the last one instead."""
-    with opened("table", os.path.join(name, "SPECTRAL_WINDOW")) as tb:
+    with opened("table", os.path.join(readable(name), "SPECTRAL_WINDOW")) as tb:
         counts = tb.getcol("NUM_CHAN")
     for window, ranges in re.findall(r"(?:^|,)\s*(\d+)\s*:([^,]*)", spw):
         last = counts[int(window)] - 1
@@ -100,7 +112,7 @@ def _rows_with_channels(name, rows, channels):
 def _raise_bad_expression(name, strings):
     """Find the parameter that the parser did not understand: it selects all rows and says False."""
     for parameter, value in strings.items():
-        with opened("ms", name) as tool:
+        with opened("ms", readable(name)) as tool:
             if tool.msselect({MSSELECT_KEYS[parameter]: value}) or tool.nrow(True) == 0:
                 continue
             try:

@@ -10,7 +10,7 @@ import numpy as np
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.images import write_image
 from casa_sara.casa.quantities import radians
-from casa_sara.casa.tools import opened, scratch_folder
+from casa_sara.casa.tools import made, opened, scratch_folder
 
 __all__ = ["fit_beam", "restore", "restoring_beam_words", "write_corrected"]
 
@@ -114,6 +114,7 @@ def restore(root, restoringbeam=(), specmode="mfs"):
         deconvolver.restore()
     finally:
         deconvolver.done()
+    made(root + ".image", f"restoringbeam = {words}")
 
 
 def write_corrected(root, plane, model):

@@ -8,12 +8,14 @@ before anything is computed. Nothing is written to the MeasurementSets.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from casa_sara.casa.cells import lacking_cells
 from casa_sara.casa.integrity import check_measurement_set, reading
 from casa_sara.casa.msselect import MSSELECT_KEYS, in_words, msselect
+from casa_sara.casa.subtables import check_rows, readable, texts
 from casa_sara.casa.tools import opened
 
 __all__ = ["UNPOLARISED", "RowGroup", "SelectedMS", "select_data"]
@@ -48,6 +50,9 @@ class RowGroup:
     either : bool, whether one of the two will do where the other has no weight, as if the source were unpolarised
     weighing : tuple of int, the first correlation and the last: tclean's imaging weight is the mean of theirs
     correlations : tuple of str, all the correlations of the rows
+    dd : int, number of the data description
+    nchan : int, number of channels of the spectral window
+    lacking : dict, array column → the rows that hold no cell of it, increasing; other columns have one in every row
     """
 
     spw: int
@@ -62,6 +67,19 @@ class RowGroup:
     divisor: complex = 2
     either: bool = False
     weighing: tuple[int, ...] = ()
+    dd: int = 0
+    nchan: int = 0
+    lacking: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def cell_shape(self) -> tuple[int, int]:
+        """Correlations and channels of a cell of DATA."""
+        return len(self.correlations), self.nchan
+
+    def has(self, column, rows):
+        """Return whether these rows (R,) hold a cell of an array column, bool (R,)."""
+        lacking = self.lacking.get(column, np.arange(0))
+        return np.searchsorted(lacking, rows, "left") == np.searchsorted(lacking, rows, "right")
 
 
 @dataclass(frozen=True)
@@ -169,14 +187,13 @@ def _describe(number, name, column, rows, wanted, notes):
         field_ids = np.unique(tb.getcol("FIELD_ID")[rows])
         observation = int(tb.getcell("OBSERVATION_ID", int(rows[0])))
         start_s = float(tb.getcell("TIME", int(rows[0])))
-        for first in (int(rows[description == dd][0]) for dd in np.unique(description)):
-            if not tb.iscelldefined(column, first):
-                raise ValueError(f"the {column} column of '{name}' is empty at row {first}")
+    check_rows(name, FIELD=field_ids, DATA_DESCRIPTION=np.unique(description))
     _refuse_moving(name, field_ids)
-    with opened("msmetadata", name) as md:
+    with opened("msmetadata", readable(name)) as md:
         groups = []
         for dd in np.unique(description):
             spw = md.spwfordatadesc(int(dd))
+            check_rows(name, SPECTRAL_WINDOW=[spw], POLARIZATION=[md.polidfordatadesc(int(dd))])
             codes = np.ravel(md.corrtypesforpol(md.polidfordatadesc(int(dd)))).tolist()
             chosen = channels.get(spw, np.arange(md.nchan(spw)))
             if chosen[-1] > _LAST_CHANNEL:
@@ -191,8 +208,13 @@ def _describe(number, name, column, rows, wanted, notes):
                     frame=md.reffreq(spw)["refer"],
                     **_formation(name, spw, codes, stokes, notes),
                     correlations=tuple(_STOKES_CODES.get(code, str(code)) for code in codes),
+                    dd=int(dd),
+                    nchan=md.nchan(spw),
                 )
             )
+        groups = _with_lacking(name, column, groups)
+        if all(group.has(column, group.rows).sum() == 0 for group in groups):
+            raise ValueError(f"vis: the {column} column of '{name}' is empty at row {rows[0]}, and at all others that are selected")
         return SelectedMS(
             number=number,
             name=name,
@@ -203,6 +225,18 @@ def _describe(number, name, column, rows, wanted, notes):
             position=_position(md, observation),
             start_s=start_s,
         )
+
+
+def _with_lacking(name, column, groups):
+    """Return the groups with the rows that lack cells; raise where a cell does not fit spectral window and correlations."""
+    wanted = {}
+    for group in groups:
+        matrix, vector = group.cell_shape, group.cell_shape[:1]
+        wanted[group.dd] = group.rows, {column: matrix, "FLAG": matrix, "WEIGHT": vector, "SIGMA": vector,
+                                        "WEIGHT_SPECTRUM": matrix, "SIGMA_SPECTRUM": matrix}
+    with opened("table", name) as tb:
+        lacking = lacking_cells(tb, name, wanted)
+    return [replace(group, lacking=lacking[group.dd]) for group in groups]
 
 
 def _position(md, observation):
@@ -242,12 +276,12 @@ def _formation(name, spw, codes, stokes, notes):
 
 def _refuse_moving(name, field_ids):
     """Raise when a selected field moves on the sky: its phase centre is not one direction."""
-    with opened("table", os.path.join(name, "FIELD")) as tb:
-        moving = tb.getcol("NUM_POLY")[field_ids] > 0
+    with opened("table", os.path.join(readable(name), "FIELD")) as tb:
+        moving = np.array([np.any(tb.getcell("PHASE_DIR", int(number))[:, 1:]) for number in field_ids])
         if "EPHEMERIS_ID" in tb.colnames():
             moving |= tb.getcol("EPHEMERIS_ID")[field_ids] >= 0
-        names = np.array(tb.getcol("NAME"))[field_ids]
     if moving.any():
+        names = np.array(texts(name, "FIELD", "NAME"))[field_ids]
         raise ValueError(
             f"field {field_ids[moving].tolist()} ({', '.join(names[moving])}) of '{name}' moves on the sky "
             "(ephemeris or polynomial): moving sources cannot be imaged, select other fields"

@@ -11,6 +11,7 @@ import numpy as np
 from casa_sara.casa.fitsfiles import opened_image
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.regrid import PixelMap, corners, interpolated, on_plane
+from casa_sara.casa.tools import safe_record
 from casa_sara.casa.units import brightness_unit
 
 __all__ = ["SkyImage", "SkyPlane", "beam_numbers", "check_sky_axes", "read_header", "read_sky_image", "unit_of"]
@@ -195,7 +196,7 @@ def read_sky_image(name, parameter, units):
             check_sky_axes(name, parameter, csys)
             _check_plane(name, parameter, shape, csys)
             pixels = read_pixels(ia)
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
     unit, factor = unit_of(given, csys)
     if units is not None and unit not in units:
@@ -206,7 +207,7 @@ def read_sky_image(name, parameter, units):
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
-    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(csys.torecord(), shape[:2]), _parameters(history))
+    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]), _parameters(history))
 
 
 def read_header(name):

@@ -15,6 +15,7 @@ from casa_sara.casa.frames import Geometry, image_direction
 from casa_sara.casa.imageplane import define_image_plane
 from casa_sara.casa.quantities import check_frequency, check_spectral
 from casa_sara.casa.selection import select_data
+from casa_sara.casa.subtables import readable
 from casa_sara.casa.tools import opened
 
 __all__ = ["SpectralAxis", "channel_number", "channels_of", "samples_of_channels", "spectral_axis"]
@@ -167,7 +168,7 @@ def channels_of(visibilities, selection, axis):
     factors = np.ones(rows.row.size)
     for ms in select_data(selection)[0]:
         geometry = Geometry(ms, visibilities.phase_center)
-        with opened("msmetadata", ms.name) as md:
+        with opened("msmetadata", readable(ms.name)) as md:
             for spw, frame in {(group.spw, group.frame) for group in ms.groups}:
                 here = (rows.ms == ms.number) & (rows.spw == spw)
                 factors[here] = geometry.lsrk_factors(frame, rows.field[here], rows.time[here])

@@ -10,7 +10,7 @@ from casa_sara.casa.fitsfiles import is_fits, opened_image
 from casa_sara.casa.imageplane import read_pixels
 from casa_sara.casa.images import write_image
 from casa_sara.casa.skyimage import check_sky_axes
-from casa_sara.casa.tools import opened, scratch_folder
+from casa_sara.casa.tools import made, opened, scratch_folder
 
 __all__ = ["read_support"]
 
@@ -76,7 +76,7 @@ def _mask_of(entry, plane):
                              f"{' '.join(str(error).split())}") from error
         finally:
             deconvolver.done()
-        with opened("image", root + ".mask") as ia:
+        with opened("image", made(root + ".mask", f"mask = '{entry}'")) as ia:
             return read_pixels(ia) > 0
 
 

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import errno
 import math
+import os
 import shutil
 import tempfile
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
-__all__ = ["opened", "scratch_folder"]
+__all__ = ["check_handles", "made", "more_handles", "opened", "safe_record", "scratch_folder"]
+
+_HANDLES = 64  # for what CASA opens beside the MeasurementSets
 
 
 @contextmanager
@@ -22,6 +25,85 @@ def opened(tool_name, *args, **options):
         yield tool
     finally:
         tool.close()
+
+
+def made(path, parameter):
+    """Return the path of what CASA was asked to make; where it failed it may have said so in its log only.
+
+    Parameters
+    ----------
+    path : str
+    parameter : str
+        Task parameter with its value, for the message.
+
+    Raises
+    ------
+    ValueError
+    """
+    if not os.path.exists(path):
+        raise ValueError(f"{parameter}: CASA makes no {os.path.splitext(path)[1]} image of it; the reason stands in its log")
+    return path
+
+
+def safe_record(csys):
+    """Return the record of a coordinate system; CASA ends the process where its observer or telescope is not UTF-8."""
+    for read, write in ((csys.observer, csys.setobserver), (csys.telescope, csys.settelescope)):
+        try:
+            read()
+        except UnicodeDecodeError:
+            write("")
+    return csys.torecord()
+
+
+@contextmanager
+def more_handles(names):
+    """Let the process open, for a while, as many files as these MeasurementSets have, as far as the system lets it."""
+    try:
+        import resource
+    except ImportError:  # a system without such limits
+        yield
+        return
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = _open_handles() + sum(map(_files, names)) + _HANDLES
+    wanted = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+    changed = soft != resource.RLIM_INFINITY and soft < wanted
+    if changed:
+        with suppress(ValueError, OSError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    try:
+        yield
+    finally:
+        if changed:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+def check_handles(name, names):
+    """Raise unless the process may open the files of one more of several MeasurementSets: CASA ends it where it may not.
+
+    Raises
+    ------
+    OSError
+        With how many files the process may open.
+    """
+    try:
+        import resource
+    except ImportError:
+        return
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft != resource.RLIM_INFINITY and _open_handles() + _files(name) + _HANDLES > soft:
+        raise OSError(errno.EMFILE, f"vis has {len(names)} MeasurementSets, and CASA opens all of them at once for the "
+                      f"coordinates of the image: there are no handles left for '{name}', of the {soft} files that this "
+                      "process may open; raise that (ulimit -n), or join MeasurementSets with concat")
+
+
+def _files(name):
+    """Return the number of files of a MeasurementSet, which is more than CASA opens."""
+    return sum(len(files) for _, _, files in os.walk(name))
+
+
+def _open_handles():
+    """Return how many files this process has open."""
+    return len(os.listdir("/dev/fd"))
 
 
 @contextmanager

@@ -44,8 +44,8 @@ class Usability:
     def __call__(self, chunk):
         """Return which samples to keep of R rows and C channels, bool (R, C), and count the others.
 
-        Beside flags and numbers that are none, these are left out: weights and data beyond single precision; baselines
-        of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
+        Beside flags, cells that are not there and numbers that are none, these are left out: weights and data beyond single
+        precision; baselines of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
 
         A correlation has no weight where its weight is not a number, 0, negative or below 1e-30 /Jy². Where the other one is
         enough, as for Stokes I, it has none either below 1e-6 of the other's, and what it holds there does not matter.
@@ -63,6 +63,8 @@ class Usability:
         finite = np.all([np.isfinite(vis) | ~there for vis, there in zip(chunk.vis, weighted)], axis=0)
         self._leave_out(ok, "autocorrelation", (chunk.columns["antenna1"] == chunk.columns["antenna2"])[:, None])
         self._leave_out(ok, "flagged row", chunk.flag_row[:, None])
+        for column, rows in chunk.undefined.items():
+            self._leave_out(ok, f"undefined {column}", rows[:, None])
         self._leave_out(ok, "flagged", chunk.flag)
         self._leave_out(ok, "non-finite data", ~finite)
         self._leave_out(ok, "non-finite weight", np.any([np.isinf(hand) for hand in weights], axis=0))

@@ -18,7 +18,9 @@ import re
 import numpy as np
 
 from casa_sara.casa.frames import SPEED_OF_LIGHT
+from casa_sara.casa.msselect import for_parser
 from casa_sara.casa.quantities import radians
+from casa_sara.casa.subtables import readable
 from casa_sara.casa.tools import opened
 from casa_sara.casa.usable import IN_FLAGS
 from casa_sara.parallel import SERIAL
@@ -37,8 +39,8 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     The uv cells are square, of side 1/(field of view) of the larger image side. imager reads
     the selection again, without autocorrelations and flagged rows; the MeasurementSets are
     opened read-only and nothing is written to them. Where samples were left out that no flag
-    told it of, where one hand has no weight, and where its grid cannot be right, because it holds
-    less than the sample itself, the samples are counted here.
+    told it of, where one hand has no weight, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM, and where its
+    grid cannot be right, because it holds less than the sample itself, the samples are counted here.
 
     Parameters
     ----------
@@ -61,7 +63,8 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     u, v = _field_uv(visibilities, "data")
     cells = _cells(u, v, (side, side), (cell, cell))
     density = np.zeros(visibilities.size, np.float32)
-    if selection is not None and visibilities.dropped.keys() <= set(IN_FLAGS) and not visibilities.alone:
+    in_flags = visibilities.dropped.keys() <= set(IN_FLAGS)
+    if selection is not None and in_flags and not visibilities.alone and not visibilities.mixed_weights:
         for number in np.unique(np.concatenate(comm.gather(np.unique(visibilities.rows.ms)))):
             try:
                 density += comm.once(_imager_grid, visibilities.ms_names[number], selection.of(number), side, cell)[cells]
@@ -162,8 +165,8 @@ def _imager_grid(name, strings, side, cell):
 
     im = casatools.imager()
     try:
-        chosen = {_SELECTVIS_KEYS.get(parameter, parameter): value for parameter, value in strings.items()}
-        im.selectvis(vis=name, writeaccess=False, taql="ANTENNA1 != ANTENNA2 && !FLAG_ROW", **chosen)
+        chosen = {_SELECTVIS_KEYS.get(parameter, parameter): value for parameter, value in for_parser(name, strings).items()}
+        im.selectvis(vis=readable(name), writeaccess=False, taql="ANTENNA1 != ANTENNA2 && !FLAG_ROW", **chosen)
         im.defineimage(nx=side, ny=side, cellx=f"{cell!r}rad", celly=f"{cell!r}rad", mode="mfs", stokes="I")
         im.weight(type="uniform", npixels=side)
         return im.getweightgrid(type="imaging").reshape(-1, order="F")
@@ -196,7 +199,7 @@ def _channel_wave_numbers(visibilities):
     """Return wavelengths per metre (M,) at the channel frequencies as they stand in the data."""
     rows, wave_numbers = visibilities.rows, np.empty(visibilities.size)
     for ms, spws in visibilities.spws.items():
-        with opened("msmetadata", visibilities.ms_names[ms]) as md:
+        with opened("msmetadata", readable(visibilities.ms_names[ms])) as md:
             for spw in spws:
                 here = ((rows.ms == ms) & (rows.spw == spw))[visibilities.row]
                 wave_numbers[here] = md.chanfreqs(spw)[visibilities.chan[here]] / SPEED_OF_LIGHT

@@ -372,7 +372,9 @@ class _tsara:
         Opened by restoration = True.
         True makes imagename.image.pbcor, which is .image divided by .pb, and imagename.model.pbcor,
         .model divided by .pb: brightness on the sky, where all other images show what the antennas
-        see of it. Below pblimit both are zero and masked.
+        see of it. Below pblimit both are zero and masked. Where CASA has no primary beam of the
+        telescope, and its antennas no diameter, .pb is 1 everywhere, which a warning says, and these
+        images are those that were divided.
 
     method : {'tsara', 'dabbech2018'}, default 'tsara'
         Both solve the same problem with the same operators, and make the same products:

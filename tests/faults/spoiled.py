@@ -8,7 +8,7 @@ import os
 import shutil
 
 import numpy as np
-from simulated_ms import column, edit, remove_columns, simulate
+from simulated_ms import _tool, column, edit, remove_columns, simulate
 
 ARCSEC = np.radians(1 / 3600)
 SKY = ((1.0, -5 * ARCSEC, 7 * ARCSEC), (0.5, 8 * ARCSEC, -3 * ARCSEC))
@@ -120,3 +120,60 @@ BROKEN = {
     "field number beyond the table": put("FIELD_ID", ..., 5),
     "antenna number beyond the table": put("ANTENNA2", ROW, 50),
 }
+
+
+# Cells: columns written anew, cell by cell -------------------------------------------------------
+
+
+def remake(col, change, manager="StandardStMan", **description):
+    """Return a function that writes a column of a MeasurementSet (or of `NAME.ms/SUBTABLE`) anew, cell by cell.
+
+    Parameters
+    ----------
+    col : str
+    change : callable
+        Takes the list of cells, None where one is undefined, and returns the new list.
+    manager : str
+        Storage manager of the new column: 'StandardStMan', 'TiledShapeStMan', 'TiledColumnStMan', 'IncrementalStMan'.
+    **description
+        Entries of the column's description that change: valueType, ndim (0 makes a scalar column), shape.
+    """
+
+    def spoil(name):
+        tb = _tool("table")
+        tb.open(str(name), nomodify=False)
+        try:
+            cells = change([tb.getcell(col, row) if tb.iscelldefined(col, row) else None for row in range(tb.nrows())])
+            old = tb.getcoldesc(col)
+            new = {key: old[key] for key in ("valueType", "comment", "keywords", "ndim") if key in old} | description
+            new = {key: value for key, value in new.items() if (key, value) != ("ndim", 0)}
+            new |= dict(option=4 if "shape" in new else 0, maxlen=0, dataManagerType=manager, dataManagerGroup="anew")
+            tiles = dict(DEFAULTTILESHAPE=[2] * new.get("ndim", 0) + [16])
+            try:
+                tb.removecols([col])
+            except RuntimeError:  # an incremental storage manager lets none go
+                tb.renamecol(col, "OLD_" + col)
+            tb.addcols({col: new}, dict(TYPE=manager, NAME="anew", SPEC=tiles if manager.startswith("Tiled") else {}))
+            for row, cell in enumerate(cells):
+                if cell is not None:
+                    tb.putcell(col, row, cell)
+        finally:
+            tb.close()
+
+    return spoil
+
+
+def cells(col, rows, change, **options):
+    """Return a function that changes the cells of these rows (all where None) of a column; `change` may return None."""
+    return remake(col, lambda old: [change(cell) if rows is None or row in rows else cell for row, cell in enumerate(old)],
+                  **options)
+
+
+def undefined(col, rows=None, **options):
+    """Return a function that takes the cells of these rows (all where None) out of a column."""
+    return cells(col, rows, lambda cell: None, **options)
+
+
+def shaped(col, rows, shape, /, **options):
+    """Return a function that gives the cells of these rows (all where None) another shape."""
+    return cells(col, rows, lambda cell: np.resize(cell, shape), **options)

@@ -8,7 +8,7 @@ import pytest
 casatools = pytest.importorskip("casatools")
 
 from simulated_ms import column, edit, pixels  # noqa: E402
-from spoiled import GRID, SKY, observe  # noqa: E402
+from spoiled import GRID, observe  # noqa: E402
 
 from casa_sara import saracompare, tsara  # noqa: E402
 from casa_sara.casa.ms import read_visibilities  # noqa: E402
