@@ -100,8 +100,8 @@ def _tiled_shapes(tb):
     for manager in tb.getdminfo().values():
         if "HYPERCUBES" in manager["SPEC"]:
             cubes = manager["SPEC"]["HYPERCUBES"].values()
-            shapes, count = {tuple(cube["CellShape"].tolist()) for cube in cubes}, sum(int(cube["CubeShape"][-1]) for cube in cubes)
-            tiles |= dict.fromkeys(manager["COLUMNS"], (shapes, count))
+            shapes = {tuple(cube["CellShape"].tolist()) for cube in cubes}
+            tiles |= dict.fromkeys(manager["COLUMNS"], (shapes, sum(int(cube["CubeShape"][-1]) for cube in cubes)))
     return tiles
 
 

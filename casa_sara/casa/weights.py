@@ -37,8 +37,8 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     The uv cells are square, of side 1/(field of view) of the larger image side. imager reads
     the selection again, without autocorrelations and flagged rows; the MeasurementSets are
     opened read-only and nothing is written to them. Where samples were left out that no flag
-    told it of, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM, and where its grid cannot be right, because it holds less than the sample
-    itself, the samples are counted here.
+    told it of, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM, and where its grid
+    cannot be right, because it holds less than the sample itself, the samples are counted here.
 
     Parameters
     ----------

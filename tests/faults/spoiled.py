@@ -176,3 +176,24 @@ def undefined(col, rows=None, **options):
 def shaped(col, rows, shape, /, **options):
     """Return a function that gives the cells of these rows (all where None) another shape."""
     return cells(col, rows, lambda cell: np.resize(cell, shape), **options)
+
+
+FAULTS |= {
+    f"{col} undefined in one row, {manager}": (undefined(col, [ROW], manager=manager), OF_ROW)
+    for col in ("DATA", "FLAG", "WEIGHT") for manager in ("StandardStMan", "TiledShapeStMan")
+} | {"DATA empty in one row": (cells("DATA", [ROW], lambda cell: cell[:, :0]), OF_ROW)}
+BROKEN |= {
+    "DATA with a channel less in one row": shaped("DATA", [ROW], (2, 2)),
+    "DATA with a channel less in all rows": shaped("DATA", None, (2, 2), manager="TiledColumnStMan", shape=[2, 2]),
+    "FLAG with a channel more": shaped("FLAG", None, (2, 4), manager="TiledShapeStMan"),
+    "FLAG with channels for correlations in one row": shaped("FLAG", [ROW], (3, 2), manager="TiledShapeStMan"),
+    "WEIGHT of one correlation": shaped("WEIGHT", None, (1,)),
+    "SIGMA of three correlations in one row": shaped("SIGMA", [ROW], (3,), manager="TiledShapeStMan"),
+    "UVW undefined in one row": undefined("UVW", [ROW]),
+    "WEIGHT in double precision": remake("WEIGHT", lambda old: old, valueType="double"),
+    "DATA in double precision": remake("DATA", lambda old: old, valueType="dcomplex"),
+    "DATA undefined in all rows": undefined("DATA"),
+    "negative antenna number": put("ANTENNA1", ROW, -1),
+    "data description beyond the table": put("DATA_DESC_ID", ROW, 7),
+    "observation number beyond the table": put("OBSERVATION_ID", ROW, 7),
+}
