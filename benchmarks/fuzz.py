@@ -71,7 +71,7 @@ def main_cases():
     for col, kinds in {
         "DATA": ("dcomplex", "float", "double", "int"), "FLAG": ("int", "uchar", "float"),
         "WEIGHT": ("double", "int", "complex"), "SIGMA": ("double", "int"), "WEIGHT_SPECTRUM": ("double", "int", "complex"),
-        "UVW": ("float", "int"), "TIME": ("float", "int", "string"), "INTERVAL": ("float", "int"), "EXPOSURE": ("float",),
+        "UVW": ("float", "int"), "TIME": ("float", "string"), "INTERVAL": ("float", "int"), "EXPOSURE": ("float",),
         "FLAG_ROW": ("int",), "TIME_CENTROID": ("float",),
         **dict.fromkeys(("ANTENNA1", "ANTENNA2", "FIELD_ID", "DATA_DESC_ID", "SCAN_NUMBER", "OBSERVATION_ID", "STATE_ID"),
                         ("short", "double", "string")),
@@ -89,7 +89,7 @@ def main_cases():
     for col in ("ANTENNA1", "TIME", "FIELD_ID", "SCAN_NUMBER", "FLAG_ROW", "DATA_DESC_ID"):
         cases[f"{col} as an array"] = remake(col, lambda old: [np.array([cell]) for cell in old], ndim=1)
     for col in ("DATA", "FLAG", "WEIGHT", "UVW"):
-        cases[f"{col} as a scalar"] = remake(col, lambda old: [cell.flat[0] for cell in old], ndim=0)
+        cases[f"{col} as a scalar"] = remake(col, lambda old: [cell.flat[0].item() for cell in old], ndim=0)
     for col in MAIN_COLUMNS:
         cases[f"{col} gone"] = lacking(col)
     return cases
