@@ -62,7 +62,7 @@ def with_spectra(name, rows, of_others=False):
 @pytest.mark.parametrize("weighting", ["natural", "uniform", "briggs"])
 @pytest.mark.parametrize("part", ["first half", "second half", "every second"])
 def test_each_row_has_its_own_weights(two_windows, tmp_path, part, weighting):
-    """As tclean images the data with WEIGHT_SPECTRUM in all rows, for its density of uniform weights takes what the first has."""
+    """As tclean images the data with a WEIGHT_SPECTRUM in all rows: else its uniform weights mix the kinds, or it ends."""
     from casatasks import tclean
 
     count = column(two_windows, "TIME").size
