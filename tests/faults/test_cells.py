@@ -147,6 +147,22 @@ def test_windows_are_told_apart(two_windows, tmp_path, manager):
     assert selected(name, spw="0").groups[0].rows.size  # what is not selected does not matter
 
 
+def test_tables_that_consist_of_several(tmp_path):
+    """The storage managers of the first alone are known there."""
+    from casatasks import virtualconcat
+
+    names = [observe(tmp_path / "a.ms"), observe(tmp_path / "b.ms", date="2015/06/02")]
+    _in_all_columns(names)
+    shaped("DATA", [ROW], (3, 2), manager="TiledShapeStMan")(names[1])
+    undefined("FLAG", [ROW], manager="TiledShapeStMan")(names[1])
+    whole, rows = str(tmp_path / "whole.mms"), column(names[0], "TIME").size
+    virtualconcat(vis=names, concatvis=whole)
+    with pytest.raises(ValueError, match=rf"DATA of row {rows + ROW} has the shape \[3, 2\]"):
+        selected(whole)
+    (ms,), _ = select_data(Selection((whole,), datacolumn="corrected"))
+    assert ms.groups[0].lacking["FLAG"].tolist() == [rows + ROW]
+
+
 @pytest.mark.parametrize(("empty", "manager"), [
     (lambda cell: None, "StandardStMan"), (lambda cell: None, "TiledShapeStMan"), (lambda cell: cell[:, :0], "StandardStMan"),
 ], ids=["undefined", "undefined, tiled", "without elements"])
