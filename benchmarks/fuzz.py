@@ -44,6 +44,7 @@ MODES = {
     "cube": dict(niter=0, specmode="cube"),
     "dryrun": dict(niter=3, dryrun=True),
     "modelcolumn": dict(niter=0, savemodel="modelcolumn"),
+    "corrected": dict(niter=3, datacolumn="corrected"),
 }
 
 
@@ -54,6 +55,7 @@ def main_cases():
     """Return the ways in which columns of the main table are spoiled."""
     cases = {}
     for col, shapes in {
+        "MODEL_DATA": ((2, 2), (2, 4)), "CORRECTED_DATA": ((2, 2), (2, 4)),
         "DATA": ((2, 2), (2, 4), (1, 3), (4, 3), (3, 2), (6, 1)), "FLAG": ((2, 2), (2, 4), (1, 3), (3, 2)),
         "WEIGHT": ((1,), (3,), (4,)), "SIGMA": ((1,), (3,)), "WEIGHT_SPECTRUM": ((2, 2), (2, 4), (1, 3), (3, 2)),
         "UVW": ((2,), (4,)),
@@ -70,7 +72,7 @@ def main_cases():
     for col, kinds in {
         "DATA": ("dcomplex", "float", "double", "int"), "FLAG": ("int", "uchar", "float"),
         "WEIGHT": ("double", "int", "complex"), "SIGMA": ("double", "int"), "WEIGHT_SPECTRUM": ("double", "int", "complex"),
-        "UVW": ("float", "int"), "TIME": ("float", "int", "string"), "INTERVAL": ("float", "int"), "EXPOSURE": ("float",),
+        "UVW": ("float", "int"), "TIME": ("float", "string"), "INTERVAL": ("float", "int"), "EXPOSURE": ("float",),
         "FLAG_ROW": ("int",), "TIME_CENTROID": ("float",),
         **dict.fromkeys(("ANTENNA1", "ANTENNA2", "FIELD_ID", "DATA_DESC_ID", "SCAN_NUMBER", "OBSERVATION_ID", "STATE_ID"),
                         ("short", "double", "string")),
@@ -88,15 +90,15 @@ def main_cases():
     for col in ("ANTENNA1", "TIME", "FIELD_ID", "SCAN_NUMBER", "FLAG_ROW", "DATA_DESC_ID"):
         cases[f"{col} as an array"] = remake(col, lambda old: [np.array([cell]) for cell in old], ndim=1)
     for col in ("DATA", "FLAG", "WEIGHT", "UVW"):
-        cases[f"{col} as a scalar"] = remake(col, lambda old: [cell.flat[0] for cell in old], ndim=0)
+        cases[f"{col} as a scalar"] = remake(col, lambda old: [cell.flat[0].item() for cell in old], ndim=0)
     for col in MAIN_COLUMNS:
         cases[f"{col} gone"] = lacking(col)
     return cases
 
 
-MAIN_COLUMNS = ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "DATA", "DATA_DESC_ID", "EXPOSURE", "FEED1", "FEED2", "FIELD_ID", "FLAG",
-                "FLAG_CATEGORY", "FLAG_ROW", "INTERVAL", "OBSERVATION_ID", "PROCESSOR_ID", "SCAN_NUMBER", "SIGMA", "STATE_ID",
-                "TIME", "TIME_CENTROID", "UVW", "WEIGHT", "WEIGHT_SPECTRUM")
+MAIN_COLUMNS = ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "CORRECTED_DATA", "DATA", "DATA_DESC_ID", "EXPOSURE", "FEED1", "FEED2",
+                "FIELD_ID", "FLAG", "FLAG_CATEGORY", "FLAG_ROW", "INTERVAL", "MODEL_DATA", "OBSERVATION_ID", "PROCESSOR_ID",
+                "SCAN_NUMBER", "SIGMA", "STATE_ID", "TIME", "TIME_CENTROID", "UVW", "WEIGHT", "WEIGHT_SPECTRUM")
 _TYPES = {"short": np.int16, "int": np.int32, "uchar": np.uint8, "float": np.float32, "double": float, "complex": complex,
           "dcomplex": complex, "string": str}
 
@@ -231,7 +233,7 @@ def image(name, mode):
     """Return what is compared of the images of a MeasurementSet: the residual, or of a dry run the number of samples."""
     from casa_sara import tsara
 
-    result = tsara(vis=name, imagename="out", overwrite=True, nthreads=1, wavelets=["dirac", "db1"], **GRID, **MODES[mode])
+    result = tsara(vis=name, imagename="out", overwrite=True, nthreads=1, wavelets=["dirac", "db1"], **GRID | MODES[mode])
     if MODES[mode].get("dryrun"):
         return np.array([result["forecast"]["visibilities"]], float)
     if MODES[mode].get("savemodel"):
@@ -257,7 +259,8 @@ def attempt(spoil, mode, references, words):
     if made is None:
         named = any(word in said for word in ("vis = ", "vis: ", "datacolumn = ")) and any(word in said for word in words)
         return "clear error" if named and "cannot be read" not in said else "bare error", said
-    off = {outcome: np.abs(made - one).max() / np.abs(one).max() for outcome, one in references.items() if one.shape == made.shape}
+    off = {outcome: np.abs(made - one).max() / np.abs(one).max() for outcome, one in references.items()
+           if one.shape == made.shape}
     closest = min(off, key=off.get, default="")
     if off and off[closest] <= SAME:
         return closest, said
@@ -345,7 +348,7 @@ def main():
         work(given.tables[0], given.mode, given.words, given.work)
         return
     with tempfile.TemporaryDirectory() as folder:
-        observe(Path(folder) / "whole.ms", weight_spectrum=True, columns=("DATA",))
+        observe(Path(folder) / "whole.ms", weight_spectrum=True, columns=("DATA", "CORRECTED_DATA", "MODEL_DATA"))
         for table in given.tables:
             counts = Counter()
             for name, outcome, said in run(table, given.mode, given.words, folder):

@@ -83,11 +83,12 @@ def _doubt(tb, column, shape, tiles):
         return "TRUE"
     if "shape" in description and description["option"] & _DIRECT:
         return ""
-    held, count = tiles.get(column, (None, 0))
-    if held == {shape} and count == tb.nrows():
+    held, count = tiles.get(column, (set(), 0))
+    all_held = count == tb.nrows()  # else some rows have no cells, or are in other tables, as virtualconcat leaves them
+    if held == {shape} and all_held:
         return ""
     size = f"nelements({column}) != {math.prod(shape)}"
-    if held is not None and not any(math.prod(one) == math.prod(shape) for one in held - {shape}):
+    if all_held and not any(math.prod(one) == math.prod(shape) for one in held - {shape}):
         return size
     # with the number of elements all lengths but one tell the shape; TaQL's order of axes is the other one
     axes = [f"shape({column})[{axis}] != {length}" for axis, length in enumerate(shape[:0:-1])]
@@ -95,13 +96,13 @@ def _doubt(tb, column, shape, tiles):
 
 
 def _tiled_shapes(tb):
-    """Return of each tiled column the set of the shapes of its cells, and the number of these."""
+    """Return of each tiled column the set of the shapes of its cells, and the number of these (of one table of several)."""
     tiles = {}
     for manager in tb.getdminfo().values():
         if "HYPERCUBES" in manager["SPEC"]:
             cubes = manager["SPEC"]["HYPERCUBES"].values()
-            shapes, count = {tuple(cube["CellShape"].tolist()) for cube in cubes}, sum(int(cube["CubeShape"][-1]) for cube in cubes)
-            tiles |= dict.fromkeys(manager["COLUMNS"], (shapes, count))
+            shapes = {tuple(cube["CellShape"].tolist()) for cube in cubes}
+            tiles |= dict.fromkeys(manager["COLUMNS"], (shapes, sum(int(cube["CubeShape"][-1]) for cube in cubes)))
     return tiles
 
 

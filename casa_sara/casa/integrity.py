@@ -25,7 +25,8 @@ _REQUIRED = {
 }
 _OPTIONAL = {"complex": ("DATA", "CORRECTED_DATA", "MODEL_DATA"), "float": ("WEIGHT_SPECTRUM", "SIGMA_SPECTRUM")}
 _ARRAYS = {"UVW", "FLAG", "FLAG_CATEGORY", "SIGMA", "WEIGHT"} | {name for names in _OPTIONAL.values() for name in names}
-_IDENTIFIERS = {"ANTENNA1": "ANTENNA", "ANTENNA2": "ANTENNA", "DATA_DESC_ID": "DATA_DESCRIPTION", "OBSERVATION_ID": "OBSERVATION"}
+_IDENTIFIERS = {"ANTENNA1": "ANTENNA", "ANTENNA2": "ANTENNA", "DATA_DESC_ID": "DATA_DESCRIPTION",
+                "OBSERVATION_ID": "OBSERVATION"}
 
 
 @contextmanager
@@ -58,11 +59,11 @@ def check_measurement_set(name):
         raise ValueError(f"vis = '{name}' is a directory, but not a MeasurementSet: it holds no table.dat")
     try:
         with opened("table", name) as tb:
-            is_ms, rows = _NEEDED <= set(tb.colnames()), tb.nrows()
+            missing, rows = sorted(_NEEDED - set(tb.colnames())), tb.nrows()
     except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"vis = '{name}' cannot be opened as a table: {error}") from error
-    if not is_ms:
-        raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet")
+    if missing:
+        raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet: it has no column {', '.join(missing)}")
     if rows == 0:
         raise ValueError(f"vis = '{name}' is a MeasurementSet without rows")
     with reading(name), opened("table", name) as tb:
@@ -110,8 +111,8 @@ def _check_numbers(name):
     with opened("table", name) as tb:
         time, interval, field = (tb.getcol(column) for column in ("TIME", "INTERVAL", "FIELD_ID"))
     for column, values, right, words in (
-        ("TIME", time, (time >= 0) & (time < _LATEST_S), "a time in MJD seconds"),
-        ("INTERVAL", interval, np.isfinite(interval), "a number of seconds"),
+        ("TIME", time, (time >= 0) & (time < _LATEST_S) & ((time > 0) | ~time.any()), "a time in MJD seconds"),  # 0: not filled
+        ("INTERVAL", interval, np.abs(interval) < _LATEST_S, "a number of seconds"),
         ("FIELD_ID", field, (field >= 0) & (field < fields), f"a row of FIELD, 0 to {fields - 1}"),
     ):
         if not right.all():

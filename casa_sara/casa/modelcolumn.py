@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
+from casa_sara.casa.cells import lacking_cells
 from casa_sara.casa.child import ChildError, in_child
 from casa_sara.casa.frames import Geometry
 from casa_sara.casa.selection import select_data
@@ -50,9 +51,12 @@ def check_model_column_writable(selection):
         A MeasurementSet is write-protected.
     OSError
         The disk has no room for the column.
+    ValueError
+        There is a column, but not with a cell of the right shape in every selected row.
     """
     needed = {}
     for ms in select_data(selection)[0]:
+        _check_cells(ms)
         for folder, _, names in os.walk(ms.name):
             for path in [folder] + [os.path.join(folder, name) for name in names]:
                 if not os.access(path, os.W_OK):
@@ -65,6 +69,21 @@ def check_model_column_writable(selection):
         needed[device] = bytes_so_far + _column_bytes(ms.name), ms.name
     for count, name in needed.values():
         _check_space(name, count)
+
+
+def _check_cells(ms):
+    """Raise where a model column has no cell, or one of another shape, in a selected row: it is left to the user to remove."""
+    with opened("table", ms.name) as tb:
+        if _COLUMN not in tb.colnames():
+            return
+        wanted = {group.dd: (group.rows, {_COLUMN: group.cell_shape}) for group in ms.groups}
+        try:
+            lacking = [rows[0] for columns in lacking_cells(tb, ms.name, wanted).values() for rows in columns.values()]
+            if lacking:
+                raise ValueError(f"vis = '{ms.name}': {_COLUMN} of row {min(lacking)} is empty")
+        except ValueError as error:
+            raise ValueError(f"savemodel = 'modelcolumn': {error}; casatasks.delmod(vis={ms.name!r}, otf=False, scr=True) "
+                             f"removes {_COLUMN}, and tsara then writes a new one; or set savemodel = 'none'") from error
 
 
 def _check_space(name, count):

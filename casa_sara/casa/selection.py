@@ -214,7 +214,8 @@ def _describe(number, name, column, rows, wanted, notes):
             )
         groups = _with_lacking(name, column, groups)
         if all(group.has(column, group.rows).sum() == 0 for group in groups):
-            raise ValueError(f"vis: the {column} column of '{name}' is empty at row {rows[0]}, and at all others that are selected")
+            raise ValueError(f"vis: the {column} column of '{name}' is empty at row {rows[0]} and at all others that are "
+                             "selected")
         return SelectedMS(
             number=number,
             name=name,

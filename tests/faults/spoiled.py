@@ -8,7 +8,7 @@ import os
 import shutil
 
 import numpy as np
-from simulated_ms import _tool, column, edit, remove_columns, simulate
+from simulated_ms import _tool, column, edit, simulate
 
 ARCSEC = np.radians(1 / 3600)
 SKY = ((1.0, -5 * ARCSEC, 7 * ARCSEC), (0.5, 8 * ARCSEC, -3 * ARCSEC))
@@ -93,7 +93,23 @@ def without(subtable):
 
 
 def lacking(col, subtable=""):
-    return lambda name: remove_columns(os.path.join(name, subtable), col)
+    def spoil(name):
+        tb = _tool("table")
+        tb.open(os.path.join(name, subtable), nomodify=False)
+        try:
+            _drop(tb, col)
+        finally:
+            tb.close()
+
+    return spoil
+
+
+def _drop(tb, col):
+    """Remove a column of an open table, or give it another name where its storage manager lets none go."""
+    try:
+        tb.removecols([col])
+    except RuntimeError:
+        tb.renamecol(col, "OLD_" + col)
 
 
 def put_in(subtable, col, value):
@@ -147,13 +163,10 @@ def remake(col, change, manager="StandardStMan", **description):
             old = tb.getcoldesc(col)
             new = {key: old[key] for key in ("valueType", "comment", "keywords", "ndim") if key in old} | description
             new = {key: value for key, value in new.items() if (key, value) != ("ndim", 0)}
-            new |= dict(option=4 if "shape" in new else 0, maxlen=0, dataManagerType=manager, dataManagerGroup="anew")
+            new |= dict(option=4 if "shape" in new else 0, maxlen=0, dataManagerType=manager, dataManagerGroup="new_" + col)
             tiles = dict(DEFAULTTILESHAPE=[2] * new.get("ndim", 0) + [16])
-            try:
-                tb.removecols([col])
-            except RuntimeError:  # an incremental storage manager lets none go
-                tb.renamecol(col, "OLD_" + col)
-            tb.addcols({col: new}, dict(TYPE=manager, NAME="anew", SPEC=tiles if manager.startswith("Tiled") else {}))
+            _drop(tb, col)
+            tb.addcols({col: new}, dict(TYPE=manager, NAME="new_" + col, SPEC=tiles if manager.startswith("Tiled") else {}))
             for row, cell in enumerate(cells):
                 if cell is not None:
                     tb.putcell(col, row, cell)
@@ -177,3 +190,27 @@ def undefined(col, rows=None, **options):
 def shaped(col, rows, shape, /, **options):
     """Return a function that gives the cells of these rows (all where None) another shape."""
     return cells(col, rows, lambda cell: np.resize(cell, shape), **options)
+
+
+FAULTS |= {
+    f"{col} undefined in one row, {manager}": (undefined(col, [ROW], manager=manager), OF_ROW)
+    for col in ("DATA", "FLAG", "WEIGHT") for manager in ("StandardStMan", "TiledShapeStMan")
+} | {"DATA empty in one row": (cells("DATA", [ROW], lambda cell: cell[:, :0]), OF_ROW)}
+BROKEN |= {
+    "DATA with a channel less in one row": shaped("DATA", [ROW], (2, 2)),
+    "DATA with a channel less in all rows": shaped("DATA", None, (2, 2), manager="TiledColumnStMan", shape=[2, 2]),
+    "FLAG with a channel more": shaped("FLAG", None, (2, 4), manager="TiledShapeStMan"),
+    "FLAG with channels for correlations in one row": shaped("FLAG", [ROW], (3, 2), manager="TiledShapeStMan"),
+    "WEIGHT of one correlation": shaped("WEIGHT", None, (1,)),
+    "SIGMA of three correlations in one row": shaped("SIGMA", [ROW], (3,), manager="TiledShapeStMan"),
+    "UVW undefined in one row": undefined("UVW", [ROW]),
+    "WEIGHT in double precision": remake("WEIGHT", lambda old: old, valueType="double"),
+    "DATA in double precision": remake("DATA", lambda old: old, valueType="dcomplex"),
+    "DATA undefined in all rows": undefined("DATA"),
+    "no column TIME": lacking("TIME"),
+    "one time not filled": put("TIME", ROW, 0.0),
+    "one interval 1e30 s": put("INTERVAL", ROW, 1e30),
+    "negative antenna number": put("ANTENNA1", ROW, -1),
+    "data description beyond the table": put("DATA_DESC_ID", ROW, 7),
+    "observation number beyond the table": put("OBSERVATION_ID", ROW, 7),
+}

@@ -257,7 +257,8 @@ def try_all(whole):
 def test_a_broken_measurement_set_is_named(of_broken, fault):
     assert fault in of_broken, "the process hung or died here, or before"
     error, message, changed = of_broken[fault]
-    assert error == "ValueError" and ("vis = " in message or "datacolumn = " in message), f"{error}: {message}"
+    named = any(word in message for word in ("vis = ", "vis: ", "datacolumn = "))
+    assert error == "ValueError" and named, f"{error}: {message}"
     assert "broken.ms" in message and not changed
 
 

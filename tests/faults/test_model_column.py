@@ -8,7 +8,8 @@ import time
 import numpy as np
 import pytest
 from machinery import begun_with, fill, hashes, killed, read_only, small_disk
-from simulated_ms import column, edit, simulate
+from simulated_ms import add_column, column, edit, simulate
+from spoiled import shaped, undefined
 
 casatools = pytest.importorskip("casatools")
 
@@ -209,6 +210,31 @@ modelcolumn._write = filled
         tsara(vis=str(copy), imagename=str(tmp_path / "source"), **FINISH)
         np.testing.assert_array_equal(column(copy, "MODEL_DATA"), model)
         assert not (copy / INCOMPLETE).exists()
+
+
+@pytest.mark.parametrize("fault, words", [
+    (undefined("MODEL_DATA"), "row 0 is empty"),
+    (undefined("MODEL_DATA", range(100, 200), manager="TiledShapeStMan"), "row 100 is empty"),
+    (shaped("MODEL_DATA", None, (2, 5)), r"row 0 has the shape \[2, 5\]"),
+    (shaped("MODEL_DATA", [70], (2, 2), manager="TiledShapeStMan"), r"row 70 has the shape \[2, 2\]"),
+], ids=["no cells", "some cells", "another shape", "another shape in one row"])
+def test_a_column_that_cannot_be_written_is_refused_first(uninterrupted, copy, tmp_path, fault, words):
+    """Before anything is imaged, and the advice is good."""
+    import casatasks
+
+    model, images = uninterrupted
+    shutil.copytree(f"{images}.model", tmp_path / "source.model")
+    add_column(copy, "MODEL_DATA", column(copy, "DATA"))
+    fault(copy)
+    before = hashes(copy, "table.lock")
+    for call in (FINISH, GRID | dict(savemodel="modelcolumn", overwrite=True)):
+        with pytest.raises(ValueError, match=f"savemodel = 'modelcolumn': vis = .*MODEL_DATA of {words}") as raised:
+            tsara(vis=str(copy), imagename=str(tmp_path / "source"), **call)
+        assert f"casatasks.delmod(vis='{copy}', otf=False, scr=True)" in str(raised.value)
+    assert hashes(copy, "table.lock") == before and not (tmp_path / "source.image").exists()
+    casatasks.delmod(vis=str(copy), otf=False, scr=True)
+    tsara(vis=str(copy), imagename=str(tmp_path / "source"), savemodel="modelcolumn", overwrite=True, **GRID)
+    np.testing.assert_array_equal(column(copy, "MODEL_DATA"), model)
 
 
 def fit_beam_and(also):
