@@ -59,12 +59,12 @@ def rules() -> dict[str, dict]:
     from casa_sara.outliers import WildSamples
     from casa_sara.solver import l1_weights
     from casa_sara.solver.nnls import NNLS_ITERATIONS
+    from casa_sara.solver.point_sources import PointSources
 
-    schedule, bounds, iteration = reconstruction.schedule_of, reconstruction._bounds, reconstruction.AdaptivePPD
+    schedule, iteration = reconstruction.schedule_of, reconstruction.AdaptivePPD
     reweight, shares, no_samples = l1_weights.reweight, l1_weights._shares, WildSamples(*np.zeros((3, 0), int))
-    from_nnls = lambda ppd, norms, *others: replace(bounds(ppd, norms, *others), l2_bounds=norms)
-    undivided = lambda ppd, bounds, scale, confined, points: reweight(ppd, bounds, scale, False, points)
-    no_points = lambda filter_, gradient, model, support, significance: (support, np.zeros_like(support))
+    undivided = lambda ppd, bounds, scale, confined: reweight(ppd, bounds, scale, False)
+    no_points = lambda filter_, gradient, model, support, allowed, significance: (support, PointSources())
     asked = lambda level: {"reconstruction.schedule_of": lambda options: replace(schedule(options), significance=level)}
     return {
         "nothing": {},
@@ -77,7 +77,6 @@ def rules() -> dict[str, dict]:
         "steadiness": {"solver.reweighting._is_steady": lambda residual_norms, interval: True},
         "patience": {"solver.reweighting.PATIENCE": 10**9},
         "nearly": {"solver.reweighting.NEARLY": 1.0},
-        "half-way": {"reconstruction._bounds": from_nnls},
         "wild": {"problem.find_wild": lambda *data: no_samples},
         "over-relaxation": {"reconstruction.AdaptivePPD": partial(iteration, relaxation=1.0)},
         "neighbours": {"operators.dictionary.SaraDictionary.reweight": _reweight_alone},
