@@ -267,13 +267,11 @@ def _bounds(ppd, nnls_norms, weights, noise, options):
         return GivenBounds(chi_square_bounds(samples), **common)
     if options.databound == "fixed":
         return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)), **common)
-    # never below the noise that the data show, and from half-way between it and what NNLS leaves
-    floor, start = ppd.residual_norms / DYNAMIC_RANGE, nnls_norms
+    # from what NNLS leaves, never below the noise that the data show
+    floor = ppd.residual_norms / DYNAMIC_RANGE
     if noise is not None:
-        measured = np.asarray(noise) * np.sqrt(2.0 * samples)
-        floor = np.fmax(floor, measured)
-        start = np.where(np.isfinite(measured), np.sqrt(nnls_norms * measured), nnls_norms)
-    return AdaptiveBounds(start, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
+        floor = np.fmax(floor, np.asarray(noise) * np.sqrt(2.0 * samples))
+    return AdaptiveBounds(nnls_norms, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
                           step=options.boundstep, min_interval=options.boundinterval)
 
 
