@@ -1,4 +1,4 @@
-"""What a run will take of memory, by part, told before anything is read."""
+"""Forecast of the memory of a run, by part, before anything is read."""
 
 from __future__ import annotations
 
@@ -177,12 +177,12 @@ class Forecast:
     def lines(self):
         """The memory as lines of a table, for the log."""
         work, parts = self.workload, self.phases[self.peak_phase]
-        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak, {self.peak_phase}, for "
+        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak (phase: {self.peak_phase}) for "
                f"{work.shape[0]} x {work.shape[1]} pixels{self._channels()} and {work.samples} visibilities; "
-               f"{self.room / 1e6:.0f} MB may be taken in addition to the {self.resident / 1e6:.0f} MB held now")
+               f"{self.resident / 1e9:.2f} GB are in use now, and {self.room / 1e9:.2f} GB more are available:")
         for part, size in parts.items():
             yield f"  {part:<26}{size / 1e6:10.1f} MB"
-        yield f"  {'in all':<26}{self.needed / 1e6:10.1f} MB"
+        yield f"  {'total':<26}{self.needed / 1e6:10.1f} MB"
 
     def _channels(self):
         return f" in {self.workload.channels} channels" if self.workload.channels else ""

@@ -95,7 +95,7 @@ class Checkpoint:
         if not read:
             return
         age = time.time() - self._found["written"]
-        self.tell(f"resuming from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
+        self.tell(f"continuing from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
         self.state = None
 
     def due(self, now=False):
