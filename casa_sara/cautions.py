@@ -165,7 +165,7 @@ def beyond_baselines(model, cell_rad, shortest):
             size = FWHM * np.sqrt(np.linalg.eigvalsh(np.cov(place, aweights=flux, ddof=0))[0])
             if size > largest:
                 arcsec = np.degrees([size, largest]) * 3600
-                return [f"the shortest baseline is sensitive to scales up to {arcsec[1]:.3g} arcsec (0.6 of its fringe), but the "
-                        f"image holds a source of {arcsec[0]:.3g} arcsec: its total flux is not measured by these data; add "
+                return [f"the shortest baseline is sensitive to scales up to {arcsec[1]:.3g} arcsec (0.6 of its fringe), but "
+                        f"the image holds a source of {arcsec[0]:.3g} arcsec: its total flux is not measured by these data; add "
                         "data with shorter baselines"]
     return []

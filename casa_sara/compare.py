@@ -1,4 +1,4 @@
-"""The story of one comparison: read, one grid, one operator, measure."""
+"""One comparison of images: read, regrid, make all residuals with one operator, measure."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = ["compare_images"]
 INJECTED = 100.0  # flux of an injected source, in units of the noise per beam with natural weights
 IMAGE_EPS = 1e-6  # accuracy of the residual images
 SMALLEST_W_PHASE = 0.01  # rad, in the corners of the image, that is worth the w-term
-LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a word
+LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a note
 ARCSEC = np.radians(1 / 3600)
 RADESYS = {"J2000": "FK5", "ICRS": "ICRS", "B1950": "FK4", "B1950_VLA": "FK4"}
 VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
@@ -88,7 +88,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     injected = places(request.inject, frame, "inject")
     if injected and not (observed and any(can_be_repeated(one) for one in sets)):
         raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; "
-                         "no other imager is run again")
+                         "images of other imagers cannot be made again")
     # one operator
     if observed:
         beams = observed.beams
@@ -147,9 +147,9 @@ def _on_grid(image, plane, first, parameter, notes):
         raise ValueError(f"{parameter}: '{image.name}' has no flux within '{first.name}': should show the same sky")
     if model.shape != image.pixels.shape or not np.array_equal(model, image.pixels):
         grid = "pixels along right ascension and declination" if image is first else f"the pixels of '{first.name}'"
-        notes.append(f"'{image.name}' was put on {grid}, its flux kept")
+        notes.append(f"'{image.name}' was regridded to {grid}, with its flux conserved")
         if lost > LOST:
-            notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies beyond '{first.name}'")
+            notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies outside of '{first.name}'")
     return model
 
 
@@ -191,7 +191,7 @@ def _support(request, plane, frame, models, truth, beam, notes):
                          "part of it, above 0.5 in a mask image")
     outside = max(model[~support].max() / model.max() for model in models)
     if outside > 0.5:
-        notes.append(f"support = '{text}' leaves out a pixel of {100 * outside:.2g} % of a model's peak: is that right?")
+        notes.append(f"support = '{text}' excludes a pixel with {100 * outside:.2g} % of the peak of a model: please check it")
     return support
 
 
@@ -220,8 +220,8 @@ def _covered(plane, sets, notes):
     x, y = next(((x, y) for x, y in edges if known[x : nx - x, y : ny - y].all()), (0, 0))
     if not x:
         return plane
-    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, as far as the residual images reach: give vis for all "
-                 "of the first model")
+    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, which the residual images cover; with vis all of the "
+                 "first model is compared")
     return plane.trimmed((x, y))
 
 
@@ -230,7 +230,7 @@ def _beside(sets, plane, notes):
     beams, residuals = {}, {one.name: {} for one in sets}
     for one in sets:
         if one.residual is None:
-            notes.append(f"'{one.name}' has no residual image: give vis to have one made")
+            notes.append(f"'{one.name}' has no residual image; with vis one is made")
             continue
         if one.beam is None:
             raise ValueError(f"models: '{one.residual.name}' has no beam, nor has an image or PSF beside it: give vis, "
@@ -243,11 +243,11 @@ def _beside(sets, plane, notes):
         weighting = "briggs" if one.weighting in ("briggs", "uniform") else "natural"
         if one.weighting not in ("briggs", "natural"):
             known = f"weighting '{one.weighting}'" if one.weighting else "an unknown weighting"
-            notes.append(f"the residual of '{one.name}' has {known}; it stands under {weighting}")
+            notes.append(f"the residual of '{one.name}' has {known}; it is listed under {weighting}")
         beam = beams.setdefault(weighting, one.beam)
         if not np.allclose(beam[:2], one.beam[:2], rtol=1e-2):
-            notes.append(f"'{one.name}' has a beam of its own, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; give vis "
-                         "to compare residuals of one beam")
+            notes.append(f"'{one.name}' has another beam, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; with vis "
+                         "the residuals of all have the same beam")
         residuals[one.name][weighting] = image
     if not beams:
         beam = next((one.beam for one in sets if one.beam), None)
@@ -295,7 +295,7 @@ class _Observed:
                 for weighting, weights in self._weights.items()}
 
     def chi_square(self, left):
-        """Return Σ w|r|² / 2N of each block of residual visibilities, 1 for noise as the weights say."""
+        """Return Σ w|r|² / 2N of each block of residual visibilities: 1 for noise as given by the MS weights."""
         power = self._data.weight * np.abs(left) ** 2
         return np.bincount(self._block_of_sample, power, self._samples.size) / (2 * self._samples)
 
@@ -320,7 +320,7 @@ class _Observed:
                 self._operators[key] = sky_operator(self._data.uvw, grid, self._data.freq_hz, eps=IMAGE_EPS,
                                                     nthreads=self._nthreads)
             except ValueError as error:
-                raise ValueError(f"{what}: its pixels cannot be held against vis: {error}") from error
+                raise ValueError(f"{what}: its visibilities cannot be computed for vis: {error}") from error
         return self._operators[key]
 
 
@@ -334,6 +334,6 @@ def _common_gridder(sets, max_w, plane, notes):
                or one.parameters.get("taskname") == "tsara" and "gridder" not in one.parameters]
     if len(without) == len(sets) or phase < SMALLEST_W_PHASE:
         return "standard"
-    notes.append(f"the residuals of all are made with the w-term, which turns phases by up to {phase:.2g} rad in this image"
+    notes.append(f"the residuals of all are made with the w-term, which changes phases by up to {phase:.2g} rad in this image"
                  + "".join(f"; '{name}' was imaged without it" for name in without))
     return "wproject"

@@ -1,4 +1,4 @@
-"""The story of a spectral cube: read, give every sample its channel, and image one channel after the other."""
+"""A spectral cube: read the data, sort them by channel, and image one channel after the other."""
 
 from __future__ import annotations
 
@@ -190,7 +190,8 @@ class _Cube:
 
     def make_dirty(self, k):
         """Make the images of a channel from its first model, which is empty where none is given."""
-        log.info(f"dirty image of channel {k} (0 to {self.axis.size - 1}), {self.channels[k].freq_hz / 1e9:.9g} GHz {self.axis.frame}")
+        log.info(f"dirty image of channel {k} (0 to {self.axis.size - 1}), {self.channels[k].freq_hz / 1e9:.9g} GHz "
+                 f"{self.axis.frame}")
         start = self._startmodel(k)
         model = start if start is not None else np.zeros(self.plane.shape, np.float32)
         try:

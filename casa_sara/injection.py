@@ -83,9 +83,9 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
         try:
             recovered_point(np.zeros(plane.shape), place, injection.radius, cell)
         except ValueError as error:
-            raise ValueError(f"inject = '{name}' is outside of '{one.name}', or nearer to its edge than "
+            raise ValueError(f"inject = '{name}' is outside of '{one.name}', or closer to its edge than "
                              f"{injection.radius:.3g} arcsec: should be inside") from error
-    log.info(f"imaging '{one.name}' again, without and with {len(places)} point sources of {injection.flux:.4g} Jy")
+    log.info(f"imaging '{one.name}' again without and with {len(places)} injected point sources of {injection.flux:.4g} Jy")
     without, with_sources = _repeat(one, places, injection.flux, selection, nthreads)
     more = with_sources.astype(float) - without
     found = {}
@@ -111,7 +111,7 @@ def _repeat(one, places, flux, selection, nthreads):
     models = []
     for vis in (data.vis, data.vis + _visibilities(places, flux, data, grid)):
         solved = solve_image(replace(data, vis=vis), offsets, noise, selection, grid, options)
-        if solved.record.stop_code == STOPPED_BY_USER:  # half a run says nothing of the resolution
+        if solved.record.stop_code == STOPPED_BY_USER:  # an unfinished run does not show the resolution
             raise KeyboardInterrupt
         models.append(solved.model)
     return models

@@ -122,8 +122,8 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
         log.info(f"restart = True continues from '{checkpoint.path}'")
     released = sum(update["released"] for update in record.reweightings)
     if released:
-        log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie between "
-                 "pixel centres")
+        log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie "
+                 "between pixel centres")
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:.3f} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")

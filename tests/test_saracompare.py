@@ -534,7 +534,7 @@ def test_bad_parameters_raise_and_name_themselves(tmp_path, parameters, error, m
     (dict(inject="19h59m28.51s"), "inject = '19h59m28.51s' is not a position: should be right ascension"),
     (dict(inject="here there"), "inject = 'here there' is not a position"),
     (dict(inject="0deg 0deg"), "inject = '0deg 0deg' is outside the image"),
-    (dict(inject="19h59m28.51s +40d44m33.4s"), "inject = .* is outside of 'sara', or nearer to its edge than 2.5"),
+    (dict(inject="19h59m28.51s +40d44m33.4s"), "inject = .* is outside of 'sara', or closer to its edge than 2.5"),
     (dict(inject=EMPTY, models=["one", "one"]), "inject = .*needs vis, and images of tsara with their history"),
     (dict(injectflux=1.0), "injectflux = 1.0 has no effect without inject"),
 ])
@@ -599,7 +599,7 @@ def test_a_residual_that_does_not_cover_the_image_is_refused(tmp_path, vis):
 
 def test_pixels_too_coarse_for_the_visibilities_are_refused(tmp_path, vis):
     one = write(tmp_path / "one.model", sky((32, 32), [(1.0, 0, 0)]), cell=5.0)
-    with pytest.raises(ValueError, match="models.*pixels cannot be held against vis.*cell"):
+    with pytest.raises(ValueError, match="models.*visibilities cannot be computed for vis.*cell"):
         saracompare(models=[one, one], vis=vis, datacolumn="data")
 
 

@@ -244,7 +244,7 @@ def test_a_coarse_start_model_keeps_its_flux_and_is_pointed_out(vis):
     assert model.sum() == pytest.approx(3, rel=1e-3)
     centre = [model.sum(axis=1 - axis) @ np.arange(96) / model.sum() for axis in (0, 1)]
     assert centre == pytest.approx([48, 48 + 4], abs=0.1)
-    assert any("the shortest baseline sees scales up to" in note for note in result["sara"]["notes"])
+    assert any("the shortest baseline is sensitive to scales up to" in note for note in result["sara"]["notes"])
     assert not any("shortest baseline" in note for note in tsara(imagename="y", niter=0, **common)["sara"]["notes"])
 
 

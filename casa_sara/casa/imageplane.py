@@ -1,4 +1,4 @@
-"""The image plane as tclean lays it out: coordinates, primary beam, and what an image says of its origin.
+"""The image plane as tclean lays it out: coordinates, primary beam, and the observation that an image belongs to.
 
 CASA's own synthesisimager makes them from the selected data, so they are tclean's by construction.
 """
@@ -203,7 +203,7 @@ def _make_primary_beam(visibilities, selection, grid, root, diameters=False):
             imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
         except RuntimeError as error:
             parameters = f"{_axes_words(grid)}, vis = {list(selection.vis)}"
-            raise ValueError(f"{parameters}: CASA makes no image of them: {' '.join(str(error).split())}") from error
+            raise ValueError(f"{parameters}: CASA cannot make an image of them: {' '.join(str(error).split())}") from error
         imager.makepb()
     finally:
         imager.done()

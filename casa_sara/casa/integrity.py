@@ -31,7 +31,7 @@ _IDENTIFIERS = {"ANTENNA1": "ANTENNA", "ANTENNA2": "ANTENNA", "DATA_DESC_ID": "D
 
 @contextmanager
 def reading(name):
-    """Turn what CASA and Python say of an unreadable MeasurementSet into a ValueError that names `vis`."""
+    """Turn the errors of CASA and Python about an unreadable MeasurementSet into a ValueError that names `vis`."""
     try:
         yield
     except (RuntimeError, UnicodeDecodeError, SystemError) as error:
@@ -39,7 +39,7 @@ def reading(name):
 
 
 def check_measurement_set(name):
-    """Raise unless `name` is a MeasurementSet with rows, whose numbers CASA survives.
+    """Raise unless `name` is a MeasurementSet with rows, whose numbers do not make CASA crash.
 
     msmetadata ends the process at a frequency that is no number, and never returns from such a time. Subtables with
     something wrong are set right in a copy (:func:`casa_sara.casa.subtables.readable`), or refused where all is wrong.

@@ -56,8 +56,8 @@ def _take(path, imagename):
         try:
             _lock(handle, imagename)
             if os.fstat(handle).st_size and not _said(handle):
-                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is no lock of tsara and in "
-                                      "its way; move it, or choose another name")
+                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is not a lock file of tsara; "
+                                      "move it, or choose another name")
             if _stands(handle, path):
                 return handle
         except BaseException:
@@ -83,13 +83,13 @@ def _lock(handle, imagename):
         who = "process {pid} on {host}, since {since}," if holder else "another run, which has just started,"
         raise BlockingIOError(
             errno.EWOULDBLOCK, f"imagename = '{imagename}': {who.format_map(holder)} is writing under this name; wait "
-            "for its end, or choose another name"
+            "until it has finished, or choose another name"
         ) from None
     except OSError as error:
         if error.errno not in _WITHOUT_LOCKS:
             raise
-        log.warn(f"imagename = '{imagename}': the file system has no locks ({error.strerror}): do not start another "
-                 "run under this name")
+        log.warn(f"imagename = '{imagename}': the file system does not support locks ({error.strerror}): do not start another "
+                 "run under this name at the same time")
 
 
 def _said(handle):

@@ -16,7 +16,7 @@ _silent = False  # this process is one of several, and another one speaks
 
 
 def speak(speaks):
-    """Say whether this process writes to the log, and draws progress."""
+    """Set whether this process writes to the log and draws progress."""
     global _silent
     _silent = not speaks
 

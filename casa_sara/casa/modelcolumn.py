@@ -118,7 +118,7 @@ def _column_bytes(name):
 def write_model_column(selection, phase_center, predict):
     """Fill MODEL_DATA of the selected rows and channels, flagged ones too.
 
-    The model visibility is the same for both parallel hands (unpolarised) and 0 for cross-hands.
+    The model visibility is the same for both parallel-hand correlations (unpolarised) and 0 for cross-hand ones.
     Any model kept in the header (usescratch=False) is deleted, so that it does not go first.
     A column that is there keeps what it holds outside the selection; a new one holds
     CASA's default of 1 there. SIGINT and SIGTERM wait until the column is whole and has been read back.
@@ -257,7 +257,7 @@ def _write(ms, geometry, predict):
 
 
 def _parallel(group):
-    """Return where the parallel hands stand among the correlations."""
+    """Return the positions of the parallel-hand correlations."""
     return [k for k, name in enumerate(group.correlations) if name in ("I", "RR", "LL", "XX", "YY")]
 
 

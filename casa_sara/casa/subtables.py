@@ -1,10 +1,10 @@
-"""The subtables of a MeasurementSet: what is wrong in them, and a copy that CASA survives.
+"""The subtables of a MeasurementSet: a check of their cells, and corrected copies for CASA.
 
-One number that is none, one empty cell or one letter that is not UTF-8, be it in a row that no data refer to, and CASA
-refuses the whole MeasurementSet, never returns, or ends the process. The table tool reads all of them, so the subtables are
-looked at here first. Where something is wrong, CASA's other tools are shown a folder in its place, with links to the files
-of the MeasurementSet and a copy of the subtables that are wrong, set right. What the image depends on is refused
-when selected data refer to it; the MeasurementSet stays as it is.
+A single number that is not finite, an empty cell or a character that is not UTF-8, even in a row that no data refer to, makes
+CASA refuse the whole MeasurementSet, hang, or end the process. The table tool can read all of them, so the subtables are
+checked here first. Where a cell is wrong, CASA's other tools are given a folder with links to the files of the
+MeasurementSet and corrected copies of the subtables in question. A wrong cell on which the image depends is an error
+when selected data refer to it. The MeasurementSet itself is not changed.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class _Rule(NamedTuple):
     """
 
     column: str
-    words: str
+    words: str  # what the cell should hold, for the error message
     right: Callable[[np.ndarray, dict, dict], Any]
     instead: Callable[[dict], Any] | None = None
 

@@ -39,8 +39,8 @@ def read_support(grid, plane):
     if grid.usemask == "pb":
         support = plane.pb > grid.pbmask
         if not support.any():
-            raise ValueError(f"usemask = 'pb', pbmask = {grid.pbmask:g}: the primary beam is nowhere in the image above it: "
-                             "should be less, or the image nearer to the pointing centre")
+            raise ValueError(f"usemask = 'pb', pbmask = {grid.pbmask:g}: the primary beam is nowhere in the image above this "
+                             "value: should be less, or the image closer to the pointing centre")
         return support
     if not grid.mask:
         return None
@@ -72,7 +72,7 @@ def _mask_of(entry, plane):
             deconvolver.initminorcycle()
             deconvolver.setupmask()
         except (RuntimeError, UnicodeDecodeError) as error:
-            raise ValueError(f"mask = '{entry}': CASA makes no mask of this: "
+            raise ValueError(f"mask = '{entry}': CASA cannot make a mask of this: "
                              f"{' '.join(str(error).split())}") from error
         finally:
             deconvolver.done()

@@ -14,7 +14,7 @@ from casa_sara.parallel import SERIAL
 
 __all__ = ["IN_FLAGS", "SMALLEST", "Usability"]
 
-IN_FLAGS = ("autocorrelation", "flagged row", "flagged")  # what the MeasurementSet itself says of a sample
+IN_FLAGS = ("autocorrelation", "flagged row", "flagged")  # reasons that the flags of the MeasurementSet give
 SMALLEST, LARGEST = 1e-18, 1e18  # of √w·|V|: its square is a number in single precision
 LIGHTEST, HEAVIEST = 1e-30, 1e30  # of the weights, in 1/Jy²
 SUREST = 1e9  # √w·|V| beyond what any receiver measures
@@ -54,7 +54,7 @@ class Usability:
         -------
         ok : bool (R, C)
         weighted : list of bool (R, C)
-            For each hand, where it has a weight.
+            For each correlation, where it has a weight.
         """
         ok = np.ones(chunk.flag.shape, dtype=bool)
         weighted = _weighted(chunk)
@@ -135,7 +135,7 @@ def _is_impossible(uvw_m):
 
 
 def _weighted(chunk):
-    """Return where each hand has a weight, a list of bool (R, C)."""
+    """Return where each correlation has a weight, a list of bool (R, C)."""
     least = LIGHTEST
     if chunk.either:
         least = np.maximum(np.fmax(*chunk.weight) / ABOVE_OTHERS, LIGHTEST)

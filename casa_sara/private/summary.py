@@ -1,4 +1,4 @@
-"""The dictionary that tsara returns: tclean's, and what SARA knows besides."""
+"""The dictionary that tsara returns: that of tclean, and a record of SARA."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ __all__ = ["cube_summary", "summary"]
 
 WHY = {
     "threshold_jy_per_pixel": "kappa of the last iteration: starts at 0.15 of the mean brightness of the NNLS image, "
-    "shrinks with every re-weighting, is halved where the residual rises; sets the pace only",
-    "noise_jy_per_beam": "of the naturally weighted dirty image, from the weights and the noise levels found",
+    "decreases with every re-weighting, and is halved where the residual rises; affects the speed of convergence only",
+    "noise_jy_per_beam": "of the naturally weighted dirty image, computed from the MS weights and the noise found",
     "data_norm_sq": "largest eigenvalue of the preconditioned normal operator, by Lanczos iterations",
-    "regscale": "as given; 1 weighs the prior at the noise of one coefficient of the gradient of the data",
+    "regscale": "the task parameter; with 1, the weight of the prior is the noise of one coefficient of the gradient of the "
+    "data term",
 }
 PAPER_WHY = {
-    "threshold_jy_per_pixel": "kappa: 1e-5 of the brightest pixel of the first image, and constant",
-    "regscale": "without meaning in this method",
+    "threshold_jy_per_pixel": "kappa: constant, 1e-5 of the brightest pixel of the first image",
+    "regscale": "not used by this method",
 }
 
 

@@ -137,5 +137,6 @@ class Checkpoint:
 
     def refusal(self, reason):
         """Return the error that says why the file cannot be resumed from."""
-        return CheckpointError(f"restart = True: '{self.path}' cannot be resumed: {reason}. Run as it was begun, or "
-                               "set restart = False and overwrite = True to begin anew, or choose another imagename")
+        return CheckpointError(f"restart = True: '{self.path}' cannot be continued: {reason}. Use the same data and "
+                               "parameters, or set restart = False and overwrite = True to start anew, or choose "
+                               "another imagename")

@@ -80,7 +80,7 @@ PARAMETERS = (
 
 
 class _tsara:
-    """Image MeasurementSets with SARA: a sparse, non-negative model that fits the data to within the noise.
+    """Image MeasurementSets with SARA: sparse, non-negative, consistent with the data to within the noise.
 
     tsara reconstructs images of the sky from visibilities, continuum or cubes, as tclean does, with
     SARA instead of CLEAN. It finds the non-negative sky that is sparsest in a set of bases together
@@ -633,7 +633,7 @@ class _tsara:
     """
 
     _info_group_ = 'imaging'
-    _info_desc_ = 'Image MeasurementSets with SARA: a sparse, non-negative model that fits the data to within the noise'
+    _info_desc_ = 'Image MeasurementSets with SARA: sparse, non-negative, consistent with the data to within the noise'
 
     def __call__(
         self, vis='', selectdata=True, field='', spw='', timerange='', uvrange='', antenna='', scan='', observation='',
