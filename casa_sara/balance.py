@@ -1,4 +1,4 @@
-"""Which rank does what, so that all are ready at the same time.
+"""The division of the work among the ranks, so that all finish at the same time.
 
 The cost of one iteration, in ns on one core, measured by benchmarks/parallel.py at 2048² in single precision.  Only their
 ratios matter.

@@ -123,7 +123,7 @@ def named_suspects(blocks, doubtful):
     """Yield a line for the log about each of the `suspects`."""
     for one in doubtful:
         level = one["noise_measured"] if one["reason"] == "thermal noise" else one["noise_found"]
-        yield (f"suspect data: block {one['block']}, {blocks[one['block']].label}: its {NAMES[one['reason']]} {level:.3g} x MS "
+        yield (f"suspect data: block {one['block']}, {blocks[one['block']].label}: its {NAMES[one['reason']]} {level:#.3g} x MS "
                f"weights, {level / one['others']:.2g} times the median of the other blocks. The reconstruction allows for "
                "that; flag these data if they are bad")
 

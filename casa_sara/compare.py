@@ -39,7 +39,7 @@ VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
 
 
 def compare_images(request: Comparing, selection: Selection | None = None, single: bool = False) -> Comparison:
-    """Compare what several imagers made of one sky.
+    """Compare the images that several imagers made of one sky.
 
     The pixels of the first model are the common grid; if it is turned, mirrored or not in SIN projection, pixels of this
     size with x to the west and y to the north. With a selection of visibilities, the residual of every model is
@@ -114,7 +114,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
 
 
 def _read(request, with_residual, fewest):
-    """Read the products and name them apart."""
+    """Read the products and give them different names."""
     models, names = request.models, request.names
     if len(models) < fewest:
         raise ValueError(f"models = {list(models)}: should be {fewest} or more products to compare")
@@ -134,7 +134,7 @@ def _read(request, with_residual, fewest):
 
 
 def _on_grid(image, plane, first, parameter, notes):
-    """Return a model on the common grid, and say what became of it."""
+    """Return a model on the common grid, with notes about the regridding."""
     if not image.overlaps(plane):
         raise ValueError(f"{parameter}: '{image.name}' does not overlap '{first.name}' on the sky: should be images of "
                          "one field")
@@ -175,7 +175,7 @@ def _product(one, model, residuals, beams, cell_arcsec):
 
 
 def _support(request, plane, frame, models, truth, beam, notes):
-    """Return where the source is, as a mask image, a region or the threshold says."""
+    """Return the support of the source, from a mask image, a region or the threshold."""
     text = request.support
     if not text:
         return source_support(models, truth, request.threshold, beam, frame.cell_arcsec)
@@ -196,7 +196,7 @@ def _support(request, plane, frame, models, truth, beam, notes):
 
 
 def _inject(injected, plane, request, selection, sets, beams, measured):
-    """Add to the measures what became of point sources that were put into the visibilities."""
+    """Add the measures of the injected point sources."""
     again = [one for one in sets if can_be_repeated(one)]
     flux = request.injectflux or INJECTED * max(measured[one.name]["natural"]["sigma"] for one in again)
     widths = {weighting: float(np.sqrt(beam[0] * beam[1])) for weighting, beam in beams.items()}
@@ -210,7 +210,7 @@ def _inject(injected, plane, request, selection, sets, beams, measured):
 
 
 def _covered(plane, sets, notes):
-    """Return the plane without the edges that a residual image beside the models does not reach, as one that is turned."""
+    """Return the plane without edges that an existing residual image does not cover, such as one that is rotated."""
     known = np.ones(plane.shape, bool)
     for one in sets:
         if one.residual is not None and one.residual.overlaps(plane):
@@ -226,7 +226,7 @@ def _covered(plane, sets, notes):
 
 
 def _beside(sets, plane, notes):
-    """Return the beams and the residuals by product and weighting, of the images beside the models."""
+    """Return the beams and the residuals by product and weighting, from the existing images of the products."""
     beams, residuals = {}, {one.name: {} for one in sets}
     for one in sets:
         if one.residual is None:
@@ -259,7 +259,7 @@ def _beside(sets, plane, notes):
 
 
 class _Observed:
-    """Visibilities, and what they see of a model: always with one operator and the same weights.
+    """Visibilities, and the residuals of models, always with the same operator and the same weights.
 
     Attributes
     ----------
@@ -325,7 +325,7 @@ class _Observed:
 
 
 def _common_gridder(sets, max_w, plane, notes):
-    """Return with which measurement operator all products are held against the visibilities, and say why.
+    """Return the measurement operator for the residuals of all products, with a note about the reason.
 
     That is without the w-term where all were imaged without it, or where it is nothing; else with it.
     """

@@ -31,7 +31,7 @@ __all__ = ["Channel", "CubeResult", "make_cube"]
 
 @dataclass(frozen=True)
 class Tally:
-    """How many samples a channel has, and what was left out: what remains of its visibilities."""
+    """The number of samples of a channel, and of those left out."""
 
     size: int
     dropped: dict[str, int]
@@ -50,7 +50,7 @@ class Channel:
 
 @dataclass
 class CubeResult:
-    """What one run found, for the return value of the task; `stopped` is the code of what ended it early, else 0."""
+    """The results of one run, for the return value of the task; `stopped` is the stop code if it ended early, else 0."""
 
     data: Tally
     channels: list[Channel]
@@ -60,7 +60,7 @@ class CubeResult:
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left for a restart to go on with."""
+        """Whether the run is complete, so that a restart has nothing to continue."""
         return self.stopped not in UNFINISHED
 
     @property
@@ -190,7 +190,7 @@ class _Cube:
 
     def make_dirty(self, k):
         """Make the images of a channel from its first model, which is empty where none is given."""
-        log.info(f"dirty image of channel {k} (0 to {self.axis.size - 1}), {self.channels[k].freq_hz / 1e9:.9g} GHz "
+        log.info(f"dirty image of channel {k} (of {self.axis.size} channels), {self.channels[k].freq_hz / 1e9:.9g} GHz "
                  f"{self.axis.frame}")
         start = self._startmodel(k)
         model = start if start is not None else np.zeros(self.plane.shape, np.float32)
@@ -204,7 +204,7 @@ class _Cube:
 
     def solve(self, k, checkpoint, deadline):
         """Return the solution of a channel."""
-        log.info(f"reconstructing channel {k} (0 to {self.axis.size - 1})")
+        log.info(f"reconstructing channel {k} (of {self.axis.size} channels)")
         part, request = self._split(k), self.request
         watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations))
         return solve_image(part.data, part.offsets, part.noise, None, request.grid, request.options,

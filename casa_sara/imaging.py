@@ -50,7 +50,7 @@ IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
 
 @dataclass
 class Result:
-    """What one run found, for the return value of the task.
+    """The results of one run, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
     from the data, relative to the MS weights; `forecast` is the forecast of memory and time made before; `suspects`
@@ -70,7 +70,7 @@ class Result:
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left for a restart to go on with."""
+        """Whether the run is complete, so that a restart has nothing to continue."""
         return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
 
 
@@ -176,7 +176,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
 
 
 def _read(selection, grid, output, crew):
-    """Return this rank's visibilities, the image plane, and the grid with the spectrum that it asks for."""
+    """Return this rank's visibilities, the image plane, and the grid with its spectrum."""
     comm = crew.comm
     data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), crew)
     data.notes.extend(image_limits(data, grid, comm))
@@ -245,7 +245,7 @@ def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads,
 
 
 def _peak(name):
-    """Return the largest absolute pixel of an image that stands."""
+    """Return the largest absolute pixel of an existing image."""
     with opened("image", name) as ia:
         return float(np.abs(read_pixels(ia)).max())
 
@@ -286,7 +286,7 @@ def image_limits(data, grid, comm=SERIAL):
 
 
 def _after_iterations(samples, grid, output, limits, read_s):
-    """Seconds to keep for what comes after the iterations: images, model column, report."""
+    """Seconds to reserve for the time after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
     return writing_seconds(samples, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
@@ -305,6 +305,6 @@ def describe(data, blocks, noise, stokes, comm=SERIAL):
     for reason, count in data.dropped.items():
         log.info(f"left out: {count} visibilities, {reason}")
     for j, (block, level) in enumerate(zip(blocks, noise)):
-        measured = f"thermal noise {level:.3f} x MS weights" if np.isfinite(level) \
+        measured = f"thermal noise {level:#.3g} x MS weights" if np.isfinite(level) \
             else "too few integrations to measure the thermal noise"
         log.info(f"block {j}: {block.label}; {measured}")

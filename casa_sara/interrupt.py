@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as requests to end well."""
+"""Ctrl-C and SIGTERM as requests to stop and to write the images."""
 
 from __future__ import annotations
 

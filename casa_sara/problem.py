@@ -1,4 +1,4 @@
-"""The imaging problem of whitened visibilities, and what is found of it before the iteration."""
+"""The imaging problem of whitened visibilities, and the steps before the iteration: first image, outliers, norms."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Findings:
 
 @dataclass
 class Problem:
-    """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be other than zero.
+    """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
     `support` is None where all may.
     """

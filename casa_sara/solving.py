@@ -1,8 +1,9 @@
-"""The solution of one image within a run: sampling density, progress, limits of time, checkpoint, wild samples."""
+"""The solution of one image within a run: density of the uv coverage, progress, time limit, checkpoint, outliers."""
 
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -39,7 +40,7 @@ class Watch:
 
 
 def checkpoint_of(selection, grid, options, output):
-    """Return the checkpoint of a run, which knows the parameters that decide the model, by the names of the task.
+    """Return the checkpoint of a run, with the task parameters on which the model depends.
 
     Where the data are is none of them (they are known by their contents), nor is how many threads there are.
     """
@@ -125,7 +126,7 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
         log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie "
                  "between pixel centres")
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
-        log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:.3f} x MS weights, reduced chi-square "
+        log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")
     return reconstruction
 
@@ -139,16 +140,21 @@ class _Preparing:
         The iterations of the solver have begun.
     """
 
-    INTERVAL = 20  # iterations between two lines of the log
+    INTERVAL = 3.0  # s between two lines of the log
 
-    def __init__(self, progress):
-        self._progress, self._asked, self.over = progress, 0, False
+    def __init__(self, progress, clock=time.monotonic):
+        self._progress, self._clock, self._iteration, self.over = progress, clock, 0, False
+        self._last = clock()
 
     def __call__(self):
         """Count one more iteration."""
-        if not self.over:
-            self._asked += 1
-            self._progress.prepare(f"NNLS iteration {self._asked}", self._asked % self.INTERVAL == 0)
+        if self.over:
+            return
+        self._iteration += 1
+        due = self._clock() - self._last >= self.INTERVAL
+        if due:
+            self._last = self._clock()
+        self._progress.prepare(f"NNLS iteration {self._iteration}", due)
 
 
 def _reduced(norm, samples):

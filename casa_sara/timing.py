@@ -1,4 +1,4 @@
-"""How long a run will take, from a short measurement of the real operators on the real data."""
+"""The expected time of a run, from a short measurement of the operators on the data."""
 
 from __future__ import annotations
 

@@ -11,7 +11,7 @@ __all__ = ["BlockInfo", "RowTable", "Visibilities", "clock", "sort_into_blocks"]
 
 @dataclass
 class RowTable:
-    """What is known of each MeasurementSet row that holds at least one sample, all (R,).
+    """The metadata of each MeasurementSet row with at least one sample, all (R,).
 
     `row` counts in its own MeasurementSet, `ms` numbers the MeasurementSets (in `vis`'s
     order), `time` is the middle of the integration in MJD seconds (UTC), `interval`
@@ -128,7 +128,7 @@ class Visibilities:
 
 @dataclass(frozen=True)
 class BlockInfo:
-    """What a snapshot block holds; `start` and `end` in MJD seconds."""
+    """The contents of a data block; `start` and `end` in MJD seconds."""
 
     ms_name: str
     observations: tuple[int, ...]

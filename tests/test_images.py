@@ -5,6 +5,7 @@ import shutil
 import time
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from casa_sara.casa.products import (
 )
 from casa_sara.casa.restore import fit_beam, restore, restoring_beam_words
 from casa_sara.options import ImageGrid, Output, Selection
+from casa_sara.solving import _Preparing
 
 ARCSEC = np.pi / 180 / 3600
 OFF_CENTRE = "J2000 19h59m40.5s +40d40m02s"
@@ -469,3 +471,15 @@ def test_progress(monkeypatch, live):
     assert stream.text.count("\r") == (6 if live else 0)
     assert ("[############............] iteration 10" in stream.text) == live
     assert stream.text.endswith("\n" if live else "")
+
+
+def test_progress_of_the_first_image():
+    """A line in the log every 3 s, the live line at every iteration, and nothing once the solver iterates."""
+    calls, clock = [], iter([0.0, 1.0, 3.5, 3.6, 4.0])
+    progress = SimpleNamespace(prepare=lambda message, log: calls.append((message, log)))
+    preparing = _Preparing(progress, lambda: next(clock))
+    for _ in range(3):
+        preparing()
+    preparing.over = True
+    preparing()
+    assert calls == [("NNLS iteration 1", False), ("NNLS iteration 2", True), ("NNLS iteration 3", False)]

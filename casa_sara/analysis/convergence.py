@@ -1,4 +1,4 @@
-"""What tsara recorded of a run: how it converged, and how well each snapshot is calibrated."""
+"""Plots of the record of a run: its convergence, and the noise of each snapshot."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def _numbers(entry, text):
 
 
 def _samples_of(visibilities, entry):
-    """Return which samples an entry names, bool (M,), and what the MeasurementSets said that do not know it."""
+    """Return which samples an entry selects, bool (M,), and the errors of MeasurementSets to which it does not apply."""
     words = parsed(entry)
     wanted = _numbers(entry, words.pop("vis")) if "vis" in words else list(visibilities.spws)
     rows, found, refusals = visibilities.rows, np.zeros(visibilities.size, bool), []

@@ -1,4 +1,4 @@
-"""Whether a MeasurementSet is one, and whole enough for CASA, which a broken one can hang or crash."""
+"""Checks that a MeasurementSet is complete, since an incomplete one can make CASA hang or crash."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def check_measurement_set(name):
 
 
 def _check_columns(tb, name):
-    """Raise unless the columns of the main table are what CASA asks of a MeasurementSet."""
+    """Raise unless the columns of the main table are those that CASA requires."""
     there = tb.getdesc()
     for kind, column in [(kind, one) for kinds in (_REQUIRED, _OPTIONAL) for kind, names in kinds.items() for one in names]:
         if column not in there:

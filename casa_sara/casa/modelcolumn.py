@@ -97,7 +97,7 @@ def _check_space(name, count):
 
 
 def incomplete_columns(vis):
-    """Return which of these MeasurementSets hold a model column that a killed run left half written."""
+    """Return which of these MeasurementSets have an incomplete model column of a killed run."""
     return [name for name in vis if os.path.exists(os.path.join(name, INCOMPLETE))]
 
 
@@ -212,7 +212,7 @@ def _clear_away(name, files, description):
 
 
 def _held_open(name):
-    """Return whether this process has files of a MeasurementSet open, as far as the system tells."""
+    """Return whether this process has files of a MeasurementSet open, as far as the system reports it."""
     folder, files = os.path.realpath(name) + os.sep, "/proc/self/fd"
     opened_files = os.listdir(files) if os.path.isdir(files) else ()
     return any(os.path.realpath(os.path.join(files, file)).startswith(folder) for file in opened_files)
@@ -268,7 +268,7 @@ def _at_field_centre(predict, freq_hz, uvw, shift):
 
 
 def _read_back(ms):
-    """Yield the pieces as they stand on disk."""
+    """Yield the pieces as they are on disk."""
     with opened("table", ms.name) as tb:
         for group, rows in _pieces(ms):
             part = tb.selectrows(rows.tolist())

@@ -285,7 +285,7 @@ def _formed(chunk, group, ok, weighted):
 
 
 def _imaging_weight(weighing, alone, otherwise):
-    """Return the mean of tclean's two weights, and what the noise says, `otherwise`, where one of them cannot be used."""
+    """Return the mean of tclean's two weights, or `otherwise`, the weight by the noise, where one of them is not usable."""
     unusable = np.any([*alone, *(~(weight >= LIGHTEST) for weight in weighing)], axis=0)
     return np.where(unusable, otherwise, sum(weighing) / len(weighing))
 

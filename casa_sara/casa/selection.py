@@ -1,4 +1,4 @@
-"""Which rows, channels and correlations of the MeasurementSets are wanted, and whether they can be had.
+"""The rows, channels and correlations that are selected from the MeasurementSets, and checks of them.
 
 The selection strings go to CASA's own parser (MSSelection, the one behind tclean), so they
 mean here what they mean there. Everything that can be wrong with the input is said here,
@@ -84,7 +84,7 @@ class RowGroup:
 
 @dataclass(frozen=True)
 class SelectedMS:
-    """One MeasurementSet with what is selected of it.
+    """One MeasurementSet and the selected part of it.
 
     Attributes
     ----------
@@ -145,7 +145,7 @@ def select_data(selection, stokes=""):
 
 
 def _check_parameters(selection):
-    """Raise on what can be seen without opening anything."""
+    """Raise on errors that are found without opening a MeasurementSet."""
     if not selection.vis:
         raise ValueError("vis is empty: it takes the name of a MeasurementSet, or a list of names")
     if selection.datacolumn not in _DATA_COLUMNS:
@@ -241,7 +241,7 @@ def _with_lacking(name, column, groups):
 
 
 def _position(md, observation):
-    """Return where the telescope stands: its first antenna if CASA does not know the name, as in tclean."""
+    """Return the position of the telescope: that of its first antenna if CASA does not know the name, as in tclean."""
     try:
         return md.observatoryposition(observation)
     except RuntimeError:

@@ -1,4 +1,4 @@
-"""The spectral index that the user knows of: a number, or an image of it."""
+"""The known spectral index: a number, or an image of it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def check_spectral_index(text):
 
 
 def with_spectrum(grid, plane, reference=None):
-    """Return the grid with the spectrum that its `spectralindex` stands for.
+    """Return the grid with the spectrum given by its `spectralindex`.
 
     Parameters
     ----------

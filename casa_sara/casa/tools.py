@@ -28,7 +28,7 @@ def opened(tool_name, *args, **options):
 
 
 def made(path, parameter):
-    """Return the path of what CASA was asked to make; where it failed it may have said so in its log only.
+    """Return the path of an image that CASA was to make; it may have reported a failure in its log only.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which samples of a MeasurementSet can be used, and for what reason the others cannot.
+"""Which samples of a MeasurementSet are usable, and the reasons why the others are not.
 
 Most is seen of a sample by itself, while it is read. What is out of proportion to the others is told when all have been
 read, from what does not depend on their order: it is the same in whatever pieces they are read, and however they are
@@ -143,7 +143,7 @@ def _weighted(chunk):
 
 
 def _range_of_weights(weight, data, comm):
-    """Return the weight above which samples have a say in what is usual, and the one above which they are impossible."""
+    """Return the weight above which samples count for the statistics, and the one above which they are impossible."""
     lowest = 0.0
     for middle, share in zip(*gaps(weight, ABOVE_OTHERS, comm)):
         if share <= FEW or share < MINORITY and _share_an_antenna(data, weight > middle, comm):

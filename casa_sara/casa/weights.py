@@ -196,7 +196,7 @@ def _field_uv(visibilities, frame):
 
 
 def _channel_wave_numbers(visibilities):
-    """Return wavelengths per metre (M,) at the channel frequencies as they stand in the data."""
+    """Return wavelengths per metre (M,) at the channel frequencies as they are in the data."""
     rows, wave_numbers = visibilities.rows, np.empty(visibilities.size)
     for ms, spws in visibilities.spws.items():
         with opened("msmetadata", readable(visibilities.ms_names[ms])) as md:

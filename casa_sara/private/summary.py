@@ -101,7 +101,7 @@ def _outcome(options, ends, code, minor, sara):
 
 
 def _stop_code(channel, cube):
-    """Return the stop code of a channel: of one that was not solved, what stopped the run before it."""
+    """Return the stop code of a channel: for one that was not solved, the code of the run."""
     solved = channel.result and channel.result.reconstruction
     return solved.record.stop_code if solved else cube.stopped or ITERATION_LIMIT
 
@@ -151,7 +151,7 @@ def _sara(result, options, full):
 
 
 def _solution(result, options, full):
-    """Return what is known of a solution, nothing where there is none."""
+    """Return the entries about a solution, none where there is none."""
     solved, sara = result.reconstruction, {}
     if solved:
         record = solved.record

@@ -1,4 +1,4 @@
-"""The task tsara: what the user asked for, checked and handed to the imaging."""
+"""The task tsara: checks its parameters and runs the imaging."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _warn_of_incomplete(vis, output):
 
 
 def _report(imagename, selection, nthreads):
-    """Write the report of one run beside its images."""
+    """Write the report of one run."""
     from casa_sara.analysis.report import write_report
     from casa_sara.compare import compare_images
 
