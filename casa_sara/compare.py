@@ -161,7 +161,7 @@ def _other_data(sets, selection):
             theirs, ours = (", ".join(sorted(names)) for names in (one.data, given))
             yield f"'{one.name}' was made of {theirs}, and is held against {ours} like the others"
         if one.record.get("wild"):
-            yield f"{len(one.record['wild'])} wild samples that '{one.name}' left out are in the residuals of all"
+            yield f"{len(one.record['wild'])} outliers that '{one.name}' left out are included in the residuals of all"
 
 
 def _product(one, model, residuals, beams, cell_arcsec):

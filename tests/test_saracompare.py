@@ -581,7 +581,7 @@ def test_products_of_different_data_are_refused_without_vis(tmp_path, vis):
     comparison = compare_images(Comparing((one, two)), Selection((vis,), datacolumn="data"))
     assert comparison.measures["similarity"]["natural"] == {"one|two": np.inf}
     assert "'two' was made of b.ms, c.ms, and is held against c.ms like the others" in comparison.notes
-    assert "1 wild samples that 'one' left out are in the residuals of all" in comparison.notes
+    assert "1 outliers that 'one' left out are included in the residuals of all" in comparison.notes
     three, *_ = product(tmp_path / "three", history=["vis = ['other/a.ms']"])
     assert saracompare(models=[one, three])["similarity"]["natural"] == {"one|three": np.inf}
 
