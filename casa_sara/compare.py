@@ -159,7 +159,7 @@ def _other_data(sets, selection):
     for one in sets:
         if one.data and one.data != given:
             theirs, ours = (", ".join(sorted(names)) for names in (one.data, given))
-            yield f"'{one.name}' was made of {theirs}, and is held against {ours} like the others"
+            yield f"'{one.name}' was made from {theirs}, and is compared with {ours} like the others"
         if one.record.get("wild"):
             yield f"{len(one.record['wild'])} outliers that '{one.name}' left out are included in the residuals of all"
 
@@ -233,8 +233,8 @@ def _beside(sets, plane, notes):
             notes.append(f"'{one.name}' has no residual image; with vis one is made")
             continue
         if one.beam is None:
-            raise ValueError(f"models: '{one.residual.name}' has no beam, nor has an image or PSF beside it: give vis, "
-                             "or put the restored image there")
+            raise ValueError(f"models: '{one.residual.name}' has no beam, and there is no image or PSF with a beam: give "
+                             "vis, or add the restored image")
         image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
         if not np.isfinite(image).all():
             covered = 100 * np.isfinite(image).mean()
@@ -252,8 +252,8 @@ def _beside(sets, plane, notes):
     if not beams:
         beam = next((one.beam for one in sets if one.beam), None)
         if beam is None:
-            raise ValueError("models: none of them has a beam, in an .image, .residual or .psf beside it: give vis, or "
-                             "put a restored image there")
+            raise ValueError("models: none of them has an .image, .residual or .psf with a beam: give vis, or "
+                             "add a restored image")
         beams["natural"] = beam
     return beams, residuals
 

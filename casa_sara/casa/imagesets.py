@@ -138,8 +138,8 @@ def check_same_data(sets):
     for other, data in others:
         if data != first[1]:
             pair = [f"'{one.name}' ({', '.join(sorted(names))})" for one, names in (first, (other, data))]
-            raise ValueError(f"models: {' and '.join(pair)} are made of different data, so their residuals cannot be "
-                             "compared: give vis, and all are held against the same visibilities")
+            raise ValueError(f"models: {' and '.join(pair)} are made from different data, so their residuals cannot be "
+                             "compared: give vis, from which all residuals are then made")
 
 
 def _model_path(given, parameter):

@@ -153,7 +153,7 @@ def _mark(name):
     since = datetime.now(timezone.utc).isoformat(" ", "seconds")
     Path(name, INCOMPLETE).write_text(
         f"Process {os.getpid()} on {socket.gethostname()} began to write {_COLUMN} at {since}. Where it has ended, the "
-        "column is incomplete: tsara with restart=True, niter=0, savemodel='modelcolumn' writes it anew.\n",
+        "column is incomplete: tsara with restart=True, niter=0, savemodel='modelcolumn' writes it again.\n",
         encoding="utf-8")
 
 
