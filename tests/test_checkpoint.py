@@ -178,7 +178,7 @@ def test_a_checkpoint_of_something_else_is_refused_with_the_difference(tmp_path)
     opened(path).identify(**data)
     for change, message in [
         (dict(version="2"), "another version of casa_sara: 1, and this is 2"),
-        (dict(parameters=dict(cell=(0.1, 0.1), niter=6)), "other parameters: niter was 5 and is 6.*Run as it was begun"),
+        (dict(parameters=dict(cell=(0.1, 0.1), niter=6)), "other parameters: niter was 5 and is 6.*Use the same data and parameters"),
         (dict(parameters=dict(cell=(0.1, 0.1), niter=5, regscale=2.0)), "regscale was None and is 2.0"),
     ]:
         with pytest.raises(CheckpointError, match=f"restart = True: '{path}' cannot be continued.*{message}"):
