@@ -1,4 +1,4 @@
-"""Which rank does what, so that all are ready at the same time.
+"""The division of the work among the ranks, so that all finish at the same time.
 
 The cost of one iteration, in ns on one core, measured by benchmarks/parallel.py at 2048² in single precision.  Only their
 ratios matter.
@@ -36,7 +36,7 @@ def operator_costs(census, grid):
 
 
 def muster(comm, census, grid, options, fits=lambda crew: True):
-    """Return who does what: the fastest arrangement in which all have room.
+    """Return the division of the work among the ranks: the fastest one for which all have enough memory.
 
     Every rank that has visibilities does a whole Fourier transform, so their number, too, is chosen for the least time; the
     bases then go to whoever has least to do, the costly ones first.

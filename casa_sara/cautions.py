@@ -1,4 +1,4 @@
-"""What the user should be told of data and results, beside what is refused."""
+"""Warnings about data and results that are no errors: suspect blocks, masks, scales larger than the shortest baseline sees."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ __all__ = ["beyond_baselines", "check_confined", "left_outside", "named_suspects
 PEAK_OUTSIDE = 6.0  # standard deviations of the thermal noise
 ABOVE_INSIDE = 1.5  # times the largest residual inside: calibration errors leave as much on either side
 FAR_ABOVE = 3.0  # times the median of the other blocks
-FAR_ABOVE_WEIGHTS = 1.5  # times what the weights say
+FAR_ABOVE_WEIGHTS = 1.5  # relative to the MS weights
 SEEN, LOWEST, MAIN = 0.6, 0.05, 0.2  # of the shortest baseline's fringe; of the peak; of the flux
 BINS = 5  # in the standard deviation of a Gaussian
+NAMES = {"thermal noise": "thermal noise is", "errors": "errors (noise and calibration) are"}  # of the reasons, for the log
 FWHM = 2.3548200450309493  # of a Gaussian, in standard deviations
 
 
@@ -42,7 +43,7 @@ def thermal_noise(data, weights, noise, offsets, comm=SERIAL):
         In the order of their blocks.
     weights : real (M,)
     noise : float (d,)
-        Of each block in units of what the weights say; where it is NaN the weights are taken at their word.
+        Of each block relative to the MS weights; 1 is assumed where it is NaN.
     offsets : int (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1].
     comm : casa_sara.parallel.Serial or MPI
@@ -58,7 +59,7 @@ def thermal_noise(data, weights, noise, offsets, comm=SERIAL):
 
 
 def left_outside(residual, support, sigma):
-    """Say where the residual outside the support holds what the model was kept from.
+    """Warn where the residual outside the support holds emission that the mask keeps from the model.
 
     Parameters
     ----------
@@ -78,14 +79,14 @@ def left_outside(residual, support, sigma):
         return []
     x, y = np.unravel_index(np.argmax(outside), outside.shape)
     return [f"mask: the residual outside the mask reaches {peak:.3g} Jy/beam, {peak / sigma:.1f} times its noise, at pixel "
-            f"[{x}, {y}]: what the model may not hold raises the noise found, and disturbs what is inside"]
+            f"[{x}, {y}]: emission outside the mask raises the noise found, and its sidelobes disturb the model inside"]
 
 
 def suspects(blocks, measured, l2_bounds):
     """Find the blocks whose errors are far above those of the others.
 
     From 2M numbers a noise level is known to 1/√(4M), 2 % for the smallest block, so a factor of 3 is no chance. Two
-    levels tell, each in units of what the weights say and held against the median of the other blocks: the one that the
+    levels are tested, each relative to the MS weights, against the median of the other blocks: the one that the
     adaptation found, against the same MeasurementSet (calibration errors go with the flux that a configuration sees), or
     against all where it has fewer than three blocks; and the thermal noise measured in the data, against all.
 
@@ -122,13 +123,13 @@ def named_suspects(blocks, doubtful):
     """Yield a line for the log about each of the `suspects`."""
     for one in doubtful:
         level = one["noise_measured"] if one["reason"] == "thermal noise" else one["noise_found"]
-        yield (f"suspect: block {one['block']}, {blocks[one['block']].label}: its {one['reason']} are {level:.3g} times "
-               f"what its weights say, {level / one['others']:.2g} times the median of the others; its bound allows for "
-               "that, but flag it if it is bad")
+        yield (f"suspect data: block {one['block']}, {blocks[one['block']].label}: its {NAMES[one['reason']]} {level:#.3g} x MS "
+               f"weights, {level / one['others']:.2g} times the median of the other blocks. The reconstruction allows for "
+               "that; flag these data if they are bad")
 
 
 def beyond_baselines(model, cell_rad, shortest):
-    """Say where the model holds a source that is too large for the shortest baseline.
+    """Warn where the model holds a source that is too large for the shortest baseline.
 
     A Gaussian of FWHM θ = 0.6/u has 28 % of its flux at the baseline u (exp(−(0.6π)²/4 ln 2)): of what is larger the
     data see less than that, and what the image has of it comes from the prior. Sources are the connected regions
@@ -164,6 +165,7 @@ def beyond_baselines(model, cell_rad, shortest):
             size = FWHM * np.sqrt(np.linalg.eigvalsh(np.cov(place, aweights=flux, ddof=0))[0])
             if size > largest:
                 arcsec = np.degrees([size, largest]) * 3600
-                return [f"the shortest baseline sees scales up to {arcsec[1]:.3g} arcsec (0.6 of its fringe), and the "
-                        f"image holds a source of {arcsec[0]:.3g}: its flux is not measured; data of shorter baselines would"]
+                return [f"the shortest baseline is sensitive to scales up to {arcsec[1]:.3g} arcsec (0.6 of its fringe), but "
+                        f"the image holds a source of {arcsec[0]:.3g} arcsec: its total flux is not measured by these data; add "
+                        "data with shorter baselines"]
     return []

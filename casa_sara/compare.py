@@ -1,4 +1,4 @@
-"""The story of one comparison: read, one grid, one operator, measure."""
+"""One comparison of images: read, regrid, make all residuals with one operator, measure."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ __all__ = ["compare_images"]
 INJECTED = 100.0  # flux of an injected source, in units of the noise per beam with natural weights
 IMAGE_EPS = 1e-6  # accuracy of the residual images
 SMALLEST_W_PHASE = 0.01  # rad, in the corners of the image, that is worth the w-term
-LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a word
+LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a note
 ARCSEC = np.radians(1 / 3600)
 RADESYS = {"J2000": "FK5", "ICRS": "ICRS", "B1950": "FK4", "B1950_VLA": "FK4"}
 VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
 
 
 def compare_images(request: Comparing, selection: Selection | None = None, single: bool = False) -> Comparison:
-    """Compare what several imagers made of one sky.
+    """Compare the images that several imagers made of one sky.
 
     The pixels of the first model are the common grid; if it is turned, mirrored or not in SIN projection, pixels of this
     size with x to the west and y to the north. With a selection of visibilities, the residual of every model is
@@ -88,7 +88,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     injected = places(request.inject, frame, "inject")
     if injected and not (observed and any(can_be_repeated(one) for one in sets)):
         raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; "
-                         "no other imager is run again")
+                         "images of other imagers cannot be made again")
     # one operator
     if observed:
         beams = observed.beams
@@ -114,7 +114,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
 
 
 def _read(request, with_residual, fewest):
-    """Read the products and name them apart."""
+    """Read the products and give them different names."""
     models, names = request.models, request.names
     if len(models) < fewest:
         raise ValueError(f"models = {list(models)}: should be {fewest} or more products to compare")
@@ -134,7 +134,7 @@ def _read(request, with_residual, fewest):
 
 
 def _on_grid(image, plane, first, parameter, notes):
-    """Return a model on the common grid, and say what became of it."""
+    """Return a model on the common grid, with notes about the regridding."""
     if not image.overlaps(plane):
         raise ValueError(f"{parameter}: '{image.name}' does not overlap '{first.name}' on the sky: should be images of "
                          "one field")
@@ -147,9 +147,9 @@ def _on_grid(image, plane, first, parameter, notes):
         raise ValueError(f"{parameter}: '{image.name}' has no flux within '{first.name}': should show the same sky")
     if model.shape != image.pixels.shape or not np.array_equal(model, image.pixels):
         grid = "pixels along right ascension and declination" if image is first else f"the pixels of '{first.name}'"
-        notes.append(f"'{image.name}' was put on {grid}, its flux kept")
+        notes.append(f"'{image.name}' was regridded to {grid}, with its flux conserved")
         if lost > LOST:
-            notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies beyond '{first.name}'")
+            notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies outside of '{first.name}'")
     return model
 
 
@@ -159,9 +159,9 @@ def _other_data(sets, selection):
     for one in sets:
         if one.data and one.data != given:
             theirs, ours = (", ".join(sorted(names)) for names in (one.data, given))
-            yield f"'{one.name}' was made of {theirs}, and is held against {ours} like the others"
+            yield f"'{one.name}' was made from {theirs}, and is compared with {ours} like the others"
         if one.record.get("wild"):
-            yield f"{len(one.record['wild'])} wild samples that '{one.name}' left out are in the residuals of all"
+            yield f"{len(one.record['wild'])} outliers that '{one.name}' left out are included in the residuals of all"
 
 
 def _product(one, model, residuals, beams, cell_arcsec):
@@ -175,7 +175,7 @@ def _product(one, model, residuals, beams, cell_arcsec):
 
 
 def _support(request, plane, frame, models, truth, beam, notes):
-    """Return where the source is, as a mask image, a region or the threshold says."""
+    """Return the support of the source, from a mask image, a region or the threshold."""
     text = request.support
     if not text:
         return source_support(models, truth, request.threshold, beam, frame.cell_arcsec)
@@ -191,12 +191,12 @@ def _support(request, plane, frame, models, truth, beam, notes):
                          "part of it, above 0.5 in a mask image")
     outside = max(model[~support].max() / model.max() for model in models)
     if outside > 0.5:
-        notes.append(f"support = '{text}' leaves out a pixel of {100 * outside:.2g} % of a model's peak: is that right?")
+        notes.append(f"support = '{text}' excludes a pixel with {100 * outside:.2g} % of the peak of a model: please check it")
     return support
 
 
 def _inject(injected, plane, request, selection, sets, beams, measured):
-    """Add to the measures what became of point sources that were put into the visibilities."""
+    """Add the measures of the injected point sources."""
     again = [one for one in sets if can_be_repeated(one)]
     flux = request.injectflux or INJECTED * max(measured[one.name]["natural"]["sigma"] for one in again)
     widths = {weighting: float(np.sqrt(beam[0] * beam[1])) for weighting, beam in beams.items()}
@@ -210,7 +210,7 @@ def _inject(injected, plane, request, selection, sets, beams, measured):
 
 
 def _covered(plane, sets, notes):
-    """Return the plane without the edges that a residual image beside the models does not reach, as one that is turned."""
+    """Return the plane without edges that an existing residual image does not cover, such as one that is rotated."""
     known = np.ones(plane.shape, bool)
     for one in sets:
         if one.residual is not None and one.residual.overlaps(plane):
@@ -220,21 +220,21 @@ def _covered(plane, sets, notes):
     x, y = next(((x, y) for x, y in edges if known[x : nx - x, y : ny - y].all()), (0, 0))
     if not x:
         return plane
-    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, as far as the residual images reach: give vis for all "
-                 "of the first model")
+    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, which the residual images cover; with vis all of the "
+                 "first model is compared")
     return plane.trimmed((x, y))
 
 
 def _beside(sets, plane, notes):
-    """Return the beams and the residuals by product and weighting, of the images beside the models."""
+    """Return the beams and the residuals by product and weighting, from the existing images of the products."""
     beams, residuals = {}, {one.name: {} for one in sets}
     for one in sets:
         if one.residual is None:
-            notes.append(f"'{one.name}' has no residual image: give vis to have one made")
+            notes.append(f"'{one.name}' has no residual image; with vis one is made")
             continue
         if one.beam is None:
-            raise ValueError(f"models: '{one.residual.name}' has no beam, nor has an image or PSF beside it: give vis, "
-                             "or put the restored image there")
+            raise ValueError(f"models: '{one.residual.name}' has no beam, and there is no image or PSF with a beam: give "
+                             "vis, or add the restored image")
         image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
         if not np.isfinite(image).all():
             covered = 100 * np.isfinite(image).mean()
@@ -243,23 +243,23 @@ def _beside(sets, plane, notes):
         weighting = "briggs" if one.weighting in ("briggs", "uniform") else "natural"
         if one.weighting not in ("briggs", "natural"):
             known = f"weighting '{one.weighting}'" if one.weighting else "an unknown weighting"
-            notes.append(f"the residual of '{one.name}' has {known}; it stands under {weighting}")
+            notes.append(f"the residual of '{one.name}' has {known}; it is listed under {weighting}")
         beam = beams.setdefault(weighting, one.beam)
         if not np.allclose(beam[:2], one.beam[:2], rtol=1e-2):
-            notes.append(f"'{one.name}' has a beam of its own, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; give vis "
-                         "to compare residuals of one beam")
+            notes.append(f"'{one.name}' has another beam, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; with vis "
+                         "the residuals of all have the same beam")
         residuals[one.name][weighting] = image
     if not beams:
         beam = next((one.beam for one in sets if one.beam), None)
         if beam is None:
-            raise ValueError("models: none of them has a beam, in an .image, .residual or .psf beside it: give vis, or "
-                             "put a restored image there")
+            raise ValueError("models: none of them has an .image, .residual or .psf with a beam: give vis, or "
+                             "add a restored image")
         beams["natural"] = beam
     return beams, residuals
 
 
 class _Observed:
-    """Visibilities, and what they see of a model: always with one operator and the same weights.
+    """Visibilities, and the residuals of models, always with the same operator and the same weights.
 
     Attributes
     ----------
@@ -295,7 +295,7 @@ class _Observed:
                 for weighting, weights in self._weights.items()}
 
     def chi_square(self, left):
-        """Return Σ w|r|² / 2N of each block of residual visibilities, 1 for noise as the weights say."""
+        """Return Σ w|r|² / 2N of each block of residual visibilities: 1 for noise as given by the MS weights."""
         power = self._data.weight * np.abs(left) ** 2
         return np.bincount(self._block_of_sample, power, self._samples.size) / (2 * self._samples)
 
@@ -320,12 +320,12 @@ class _Observed:
                 self._operators[key] = sky_operator(self._data.uvw, grid, self._data.freq_hz, eps=IMAGE_EPS,
                                                     nthreads=self._nthreads)
             except ValueError as error:
-                raise ValueError(f"{what}: its pixels cannot be held against vis: {error}") from error
+                raise ValueError(f"{what}: its visibilities cannot be computed for vis: {error}") from error
         return self._operators[key]
 
 
 def _common_gridder(sets, max_w, plane, notes):
-    """Return with which measurement operator all products are held against the visibilities, and say why.
+    """Return the measurement operator for the residuals of all products, with a note about the reason.
 
     That is without the w-term where all were imaged without it, or where it is nothing; else with it.
     """
@@ -334,6 +334,6 @@ def _common_gridder(sets, max_w, plane, notes):
                or one.parameters.get("taskname") == "tsara" and "gridder" not in one.parameters]
     if len(without) == len(sets) or phase < SMALLEST_W_PHASE:
         return "standard"
-    notes.append(f"the residuals of all are made with the w-term, which turns phases by up to {phase:.2g} rad in this image"
+    notes.append(f"the residuals of all are made with the w-term, which changes phases by up to {phase:.2g} rad in this image"
                  + "".join(f"; '{name}' was imaged without it" for name in without))
     return "wproject"

@@ -1,4 +1,4 @@
-"""The story of a spectral cube: read, give every sample its channel, and image one channel after the other."""
+"""A spectral cube: read the data, sort them by channel, and image one channel after the other."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ __all__ = ["Channel", "CubeResult", "make_cube"]
 
 @dataclass(frozen=True)
 class Tally:
-    """How many samples a channel has, and what was left out: what remains of its visibilities."""
+    """The number of samples of a channel, and of those left out."""
 
     size: int
     dropped: dict[str, int]
@@ -50,7 +50,7 @@ class Channel:
 
 @dataclass
 class CubeResult:
-    """What one run found, for the return value of the task; `stopped` is the code of what ended it early, else 0."""
+    """The results of one run, for the return value of the task; `stopped` is the stop code if it ended early, else 0."""
 
     data: Tally
     channels: list[Channel]
@@ -60,7 +60,7 @@ class CubeResult:
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left for a restart to go on with."""
+        """Whether the run is complete, so that a restart has nothing to continue."""
         return self.stopped not in UNFINISHED
 
     @property
@@ -103,7 +103,7 @@ def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, optio
     check_imagename(output.imagename, cube.plane.pb.shape, 2 * output.pbcor)
     for note in data.notes:
         log.warn(note)
-    # the dirty cube: what cannot be weighed or restored is refused before the hours
+    # the dirty cube: errors of weights and beams are raised before the long part
     for k in cube.filled:
         cube.make_dirty(k)
     # solve
@@ -172,13 +172,13 @@ class _Cube:
         blank = np.diff(first) == 0
         if blank.all():
             grid = request.grid
-            raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no sample that "
-                             "can be used is in these channels")
+            raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no usable visibility "
+                             "is in these channels")
         if blank.any():
             numbers = ", ".join(map(str, np.flatnonzero(blank)))
-            data.notes.append(f"channels {numbers} are blank: no sample that can be used")
+            data.notes.append(f"channels {numbers} are blank: they have no usable visibilities")
         if first[0]:
-            log.info(f"{first[0]} samples are in none of the {axis.size} channels")
+            log.info(f"{first[0]} visibilities are in none of the {axis.size} image channels")
         plane = replace(plane, mask=plane.mask & ~blank[:, None, None])
         images = {name: np.zeros(plane.pb.shape, np.float32) for name in ("psf", "residual", "model")}
         return cls(request, data, plane, axis, order, first, [Channel(float(freq)) for freq in axis.freqs_hz], images)
@@ -190,7 +190,8 @@ class _Cube:
 
     def make_dirty(self, k):
         """Make the images of a channel from its first model, which is empty where none is given."""
-        log.info(f"channel {k} of {self.axis.size}, {self.channels[k].freq_hz / 1e9:.9g} GHz {self.axis.frame}")
+        log.info(f"dirty image of channel {k} (of {self.axis.size} channels), {self.channels[k].freq_hz / 1e9:.9g} GHz "
+                 f"{self.axis.frame}")
         start = self._startmodel(k)
         model = start if start is not None else np.zeros(self.plane.shape, np.float32)
         try:
@@ -203,7 +204,7 @@ class _Cube:
 
     def solve(self, k, checkpoint, deadline):
         """Return the solution of a channel."""
-        log.info(f"solving channel {k} of {self.axis.size}")
+        log.info(f"reconstructing channel {k} (of {self.axis.size} channels)")
         part, request = self._split(k), self.request
         watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations))
         return solve_image(part.data, part.offsets, part.noise, None, request.grid, request.options,

@@ -13,7 +13,7 @@ __all__ = ["CubeCheckpoint"]
 
 
 class CubeCheckpoint:
-    """Keeps the solutions of finished channels beside the state of the solution in progress, in one checkpoint.
+    """Keeps the solutions of finished channels and the state of the solution in progress in one checkpoint.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ class CubeCheckpoint:
         self._channel, self._solution = -1, None
 
     def identify(self, **data):
-        """Say what the data of all channels are, and take over what was read of them.
+        """Identify the data of all channels, and restore the solutions that were read for them.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""A time by which a run must have ended, its images written."""
+"""The time limit of a run, including the writing of its images."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ __all__ = ["Deadline"]
 
 
 class Deadline:
-    """Tells when to stop so that what comes after the iterations still fits.
+    """Decides when to stop the iterations, so that the images are written before the time limit.
 
     Parameters
     ----------

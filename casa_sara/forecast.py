@@ -1,4 +1,4 @@
-"""What a run will take of memory, by part, told before anything is read."""
+"""Forecast of the memory of a run, by part, before anything is read."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Workload:
 
     @classmethod
     def of(cls, census, grid, options, report=False, band=0.0, channels=0, share=1.0, crew=ALONE):
-        """The workload of a census of the data and the task's parameters, of this rank's share of them."""
+        """The workload of this rank: its share of the data that were counted (`census`), and the task's parameters."""
         writes, bases = crew.comm.rank == 0, len(options.wavelets)
         return cls(math.ceil(census.samples * crew.share), census.reach, grid.shape, grid.cell_rad,
                    len(crew.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
@@ -177,12 +177,12 @@ class Forecast:
     def lines(self):
         """The memory as lines of a table, for the log."""
         work, parts = self.workload, self.phases[self.peak_phase]
-        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak, {self.peak_phase}, for "
+        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak (phase: {self.peak_phase}) for "
                f"{work.shape[0]} x {work.shape[1]} pixels{self._channels()} and {work.samples} visibilities; "
-               f"{self.room / 1e6:.0f} MB may be taken in addition to the {self.resident / 1e6:.0f} MB held now")
+               f"{self.resident / 1e9:.2f} GB are in use now, and {self.room / 1e9:.2f} GB more are available:")
         for part, size in parts.items():
             yield f"  {part:<26}{size / 1e6:10.1f} MB"
-        yield f"  {'in all':<26}{self.needed / 1e6:10.1f} MB"
+        yield f"  {'total':<26}{self.needed / 1e6:10.1f} MB"
 
     def _channels(self):
         return f" in {self.workload.channels} channels" if self.workload.channels else ""
@@ -211,7 +211,7 @@ class Forecast:
         limit = f"maxmem = {maxmem_gb:g} GB" if maxmem_gb else "the memory available"
         raise MemoryError(
             f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of "
-            f"vis takes {least / 1e9:.2f} GB while {self.peak_phase} ({parts}, held now {self.resident / 1e9:.2f}); "
+            f"vis takes {least / 1e9:.2f} GB while {self.peak_phase} ({parts}, in use now {self.resident / 1e9:.2f}); "
             f"{limit} allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
 
     def _what_fits(self):
@@ -238,7 +238,7 @@ class Forecast:
             ways.append(f"at most {most} visibilities (select with spw, scan, …; or average them)")
         if not ways:
             return "No image fits, however small and with however few visibilities: more memory is needed"
-        return f"It would fit with {' or '.join(ways)}; fewer wavelets help too"
+        return f"It would fit with {' or '.join(ways)}; fewer wavelets also take less"
 
 
 def forecast(workload, resident, available, maxmem_gb=0.0):

@@ -1,4 +1,4 @@
-"""The story of one image: read, weigh, split, solve, write."""
+"""One image from data to products: read, compute weights, divide into blocks, solve, write."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
 
 @dataclass
 class Result:
-    """What one run found, for the return value of the task.
+    """The results of one run, for the return value of the task.
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
-    from the data, in units of what the weights say; `forecast` is what was said of memory and time before; `suspects`
-    are the blocks of :func:`casa_sara.cautions.suspects`. Of several ranks each has its own samples in `data`; `size` is
-    the number of all.
+    from the data, relative to the MS weights; `forecast` is the forecast of memory and time made before; `suspects`
+    are the blocks of :func:`casa_sara.cautions.suspects`. With several ranks, each has its own samples in `data`, and `size`
+    is the number of all.
     """
 
     data: Visibilities
@@ -70,7 +70,7 @@ class Result:
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left for a restart to go on with."""
+        """Whether the run is complete, so that a restart has nothing to continue."""
         return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
 
 
@@ -149,7 +149,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         if grid.gridder == "wproject":
             accuracy = operator_accuracy(data, offsets, noise, comm)
             log.info(WTerm.of(comm.largest(data.max_w), grid.shape, grid.cell_rad, accuracy).words)
-        _point_spread(data, grid, weighting, options, plane, comm)  # what cannot be weighed or restored is refused now
+        _point_spread(data, grid, weighting, options, plane, comm)  # errors of weights and beam are raised before the solver
         # solve
         reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
         if options.niter > 0:
@@ -176,7 +176,7 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
 
 
 def _read(selection, grid, output, crew):
-    """Return this rank's visibilities, the image plane, and the grid with the spectrum that it asks for."""
+    """Return this rank's visibilities, the image plane, and the grid with its spectrum."""
     comm = crew.comm
     data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), crew)
     data.notes.extend(image_limits(data, grid, comm))
@@ -189,7 +189,7 @@ def _read(selection, grid, output, crew):
 
 
 def _look_back(images, support, reconstruction, part, grid, comm):
-    """Point out what is doubtful about data and images; return the suspect blocks, and add the mask to the images."""
+    """Warn of what is doubtful about data and images; return the suspect blocks, and add the mask to the images."""
     data, pixels = part.data, images.pixels
     doubtful = suspects(part.blocks, part.noise, reconstruction.l2_bounds) if reconstruction else []
     for line in named_suspects(part.blocks, doubtful):
@@ -214,7 +214,7 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of."""
     weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
-    if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the hands, too
+    if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too
         sumwt = float(weights.sum(dtype=float))
     else:
         sumwt = sum_of_weights(data, weights, grid.stokes)
@@ -229,8 +229,8 @@ def _caution(data, notes=None):
 
 
 def _save_model(selection, data, grid, options, model):
-    """Write the model's visibilities into the MeasurementSets: the last phase, the images are whole."""
-    log.info("writing the model column")
+    """Write the model's visibilities into the MeasurementSets: the last phase, after the images are complete."""
+    log.info("writing MODEL_DATA")
     save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
                       cell_rad=grid.cell_rad, gridder=grid.gridder, spectrum=grid.spectrum and asdict(grid.spectrum),
                       nthreads=options.nthreads, model=model)
@@ -245,7 +245,7 @@ def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads,
 
 
 def _peak(name):
-    """Return the largest absolute pixel of an image that stands."""
+    """Return the largest absolute pixel of an existing image."""
     with opened("image", name) as ia:
         return float(np.abs(read_pixels(ia)).max())
 
@@ -266,7 +266,7 @@ def _point_spread(data, grid, weighting, options, plane, comm):
 
 
 def image_limits(data, grid, comm=SERIAL):
-    """What the user should know of this image plane and these baselines; raise where no image can be made of them."""
+    """Return warnings about this image plane and these baselines; raise where no image can be made of them."""
     notes = []
     reach = [[comm.largest(float(np.abs(axis).max(initial=0)))] for axis in data.uvw[:2]]
     max_uv, max_w = comm.largest(data.max_uv), comm.largest(data.max_w)
@@ -280,31 +280,31 @@ def image_limits(data, grid, comm=SERIAL):
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
     phase = np.pi * max_w * corner_sq
     if phase > LARGEST_W_PHASE and grid.gridder == "standard":
-        notes.append(f"the w-term is not modelled: it turns phases by up to {phase:.2g} rad in the corners of this image; "
+        notes.append(f"the w-term is not modelled: it changes phases by up to {phase:.2g} rad in the corners of this image; "
                      "gridder = 'wproject' models it")
     return notes
 
 
 def _after_iterations(samples, grid, output, limits, read_s):
-    """Seconds to keep for what comes after the iterations: images, model column, report."""
+    """Seconds to reserve for the time after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
     return writing_seconds(samples, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
 
 def nowhere_visible(grid, output):
-    """What the user should know of an image whose pixels are masked everywhere."""
-    return (f"phasecenter = '{grid.phasecenter}': the primary beam is nowhere in the image above pblimit = "
-            f"{output.pblimit:g}, and its pixels are masked everywhere")
+    """Return the warning about an image whose pixels are masked everywhere."""
+    return (f"phasecenter = '{grid.phasecenter}': the primary beam is below pblimit = {output.pblimit:g} in the whole image, so "
+            "all of its pixels are masked")
 
 
 def describe(data, blocks, noise, stokes, comm=SERIAL):
-    """Say in the log what was read."""
+    """Write to the log what was read: the visibilities, those left out, and the blocks with their noise."""
     log.info(f"{comm.total(data.size)} Stokes {stokes} visibilities, longest baseline "
              f"{comm.largest(data.max_uv) / 1e3:.4g} klambda, "
-             f"{len(blocks)} blocks")
+             f"{len(blocks)} data blocks")
     for reason, count in data.dropped.items():
-        log.info(f"left out: {count} samples, {reason}")
+        log.info(f"left out: {count} visibilities, {reason}")
     for j, (block, level) in enumerate(zip(blocks, noise)):
-        measured = f"noise measured from the data {level:.3g} times what the weights say" if np.isfinite(level) \
-            else "too few integrations to measure the noise"
+        measured = f"thermal noise {level:#.3g} x MS weights" if np.isfinite(level) \
+            else "too few integrations to measure the thermal noise"
         log.info(f"block {j}: {block.label}; {measured}")

@@ -1,4 +1,4 @@
-"""Resolution actually reached: point sources put into the visibilities, imaged again and measured."""
+"""Resolution of images, measured with point sources that are added to the visibilities."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Injection:
 
 
 def can_be_repeated(one) -> bool:
-    """Tell whether the run of an ImageSet can be repeated: it is tsara's without a mask, and the images say with what."""
+    """Return whether the run of an ImageSet can be repeated: of tsara, without a mask, and with its parameters."""
     masked = one.parameters.get("usemask", "user") != "user" or one.parameters.get("mask", "") not in ("", "[]", "['']")
     return one.parameters.get("taskname") == "tsara" and not masked
 
@@ -50,7 +50,7 @@ def spectral_index_of(one) -> str:
 
 
 def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) -> dict[str, dict[str, float]]:
-    """Image a selection without and with point sources in it, and measure what the model has more.
+    """Image a selection without and with injected point sources, and measure the difference of the models.
 
     Both times with the parameters in the history of the images, and from nothing, so that the models differ by the
     sources alone. These are points, V = S exp(2πi(ul + vm + w(n − 1))), not pixels.
@@ -83,9 +83,9 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
         try:
             recovered_point(np.zeros(plane.shape), place, injection.radius, cell)
         except ValueError as error:
-            raise ValueError(f"inject = '{name}' is outside of '{one.name}', or nearer to its edge than "
+            raise ValueError(f"inject = '{name}' is outside of '{one.name}', or closer to its edge than "
                              f"{injection.radius:.3g} arcsec: should be inside") from error
-    log.info(f"imaging '{one.name}' again, without and with {len(places)} point sources of {injection.flux:.4g} Jy")
+    log.info(f"imaging '{one.name}' again without and with {len(places)} injected point sources of {injection.flux:.4g} Jy")
     without, with_sources = _repeat(one, places, injection.flux, selection, nthreads)
     more = with_sources.astype(float) - without
     found = {}
@@ -111,7 +111,7 @@ def _repeat(one, places, flux, selection, nthreads):
     models = []
     for vis in (data.vis, data.vis + _visibilities(places, flux, data, grid)):
         solved = solve_image(replace(data, vis=vis), offsets, noise, selection, grid, options)
-        if solved.record.stop_code == STOPPED_BY_USER:  # half a run says nothing of the resolution
+        if solved.record.stop_code == STOPPED_BY_USER:  # an unfinished run does not show the resolution
             raise KeyboardInterrupt
         models.append(solved.model)
     return models
@@ -137,7 +137,7 @@ def _spectrum_at(x, y, data, grid):
 
 
 def _options(parameters, nthreads) -> SolverOptions:
-    """Return the solver's options in a history; what it does not name is at its default."""
+    """Return the solver options in a history; others have their defaults."""
     given = {field.name: _value(parameters[field.name], field.default)
              for field in fields(SolverOptions) if field.name in parameters}
     return SolverOptions(**given | {"nthreads": nthreads})

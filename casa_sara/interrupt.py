@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as requests to end well."""
+"""Ctrl-C and SIGTERM as requests to stop and to write the images."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 @contextmanager
 def stop_on_interrupt() -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether Ctrl-C was pressed, or SIGTERM came.
+    """Yield a function that returns whether Ctrl-C was pressed, or SIGTERM came.
 
     Only the first signal is such a request, and only when the function has been asked before: whoever asks will end
     well. Any other does at once what it always does (Ctrl-C raises KeyboardInterrupt, SIGTERM ends the process).

@@ -1,4 +1,4 @@
-"""Records kept in files: JSON that any program reads, written whole or not at all."""
+"""Records in JSON files, which are replaced atomically."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def load(path: str | os.PathLike) -> Any:
 
 
 def _spelled(value: Any) -> Any:
-    """Return `value` with the numbers that JSON lacks as words."""
+    """Return `value` with the numbers that JSON lacks as text."""
     if isinstance(value, dict):
         return {key: _spelled(entry) for key, entry in value.items()}
     if isinstance(value, list):
@@ -66,7 +66,7 @@ def _spelled(value: Any) -> Any:
 
 
 def _numbers(value: Any) -> Any:
-    """Return `value` with those words as numbers again."""
+    """Return `value` with that text as numbers again."""
     if isinstance(value, dict):
         return {key: _numbers(entry) for key, entry in value.items()}
     if isinstance(value, list):

@@ -1,4 +1,4 @@
-"""The noise level measured in the data themselves, from what changes between integrations."""
+"""The thermal noise, measured in the data from differences of successive integrations."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
 
 
 def noise_from_differences(visibilities, offsets, comm=SERIAL):
-    """Measure the noise of each block in units of what its weights predict.
+    """Measure the noise of each block relative to the MS weights.
 
     Along one baseline and channel the sky changes slowly and the noise does not, so
     second differences of three successive integrations,

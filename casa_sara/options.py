@@ -1,4 +1,4 @@
-"""What the user asked for, as frozen dataclasses named after the task parameters."""
+"""The task parameters, as frozen dataclasses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Wild visibilities: samples that no sky explains, found by what a first image leaves of them."""
+"""Outliers ("wild" samples): visibilities that no sky can explain, found in the residual of a first image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ``method='dabbech2018'`` does otherwise than the usual reconstruction, before the first iteration."""
+"""The differences of ``method='dabbech2018'`` from the usual reconstruction before the first iteration."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def paper_iteration(problem, dictionary, data_norm_sq, positivity):
 
 
 def paper_bounds(ppd, nnls_norms, weights, options):
-    """The bounds: from NNLS, and adapted; or what the weights or l2bound say, and fixed, for known noise (section 3).
+    """The bounds: adaptive, from NNLS; or fixed, from the MS weights or l2bound, for known noise (section 3).
 
     Parameters
     ----------

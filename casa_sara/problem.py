@@ -1,4 +1,4 @@
-"""The imaging problem of whitened visibilities, and what is found of it before the iteration."""
+"""The imaging problem of whitened visibilities, and the steps before the iteration: first image, outliers, norms."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Findings:
 
 @dataclass
 class Problem:
-    """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be other than zero.
+    """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
     `support` is None where all may.
     """
@@ -134,8 +134,8 @@ def first_image(samples, problem_of, options, stopped=lambda: False, comm=SERIAL
 def _preconditioner(samples, wanted, comm):
     """U = 1/density, largest value 1.
 
-    Samples of hardly any weight alone in their cells, as bad ones that were not flagged but weighed down, are not raised to what
-    other cells have: the density is taken to be at least 1e-2·Σw²/Σw.
+    Samples of very low weight that are alone in their uv cells (bad data that were down-weighted instead of flagged) are not
+    raised to the weight of other cells: the density is taken to be at least 1e-2·Σw²/Σw.
     """
     weight = samples.data.weight
     if not wanted:

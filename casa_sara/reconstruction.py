@@ -80,7 +80,7 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
     grid : ImageGrid
     options : SolverOptions
     noise : float (d,), optional
-        Noise of each block measured from the data, in units of what the weights say; NaN where unknown.
+        Noise of each block measured from the data, relative to the MS weights; NaN where unknown.
     startmodel : real (nx, ny), optional
         First image, Jy/pixel.
     progress, stopped : callable

@@ -1,4 +1,4 @@
-"""Before a run: what it will take, whether it fits, and for a dry run how long it would last."""
+"""Before a run: a forecast of its memory and, for a dry run, of its time."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _fullest_channel(data, selection, grid):
 
 
 def rehearse(selection, grid, options, blocks, limits):
-    """Say what a run would take: memory by part and, where it fits, time from a short measurement.
+    """Forecast the memory of a run by part and, where it fits, its time from a short measurement.
 
     Nothing is written.
 
@@ -127,9 +127,10 @@ def rehearse(selection, grid, options, blocks, limits):
 def _time_lines(timing):
     """The times as lines of a table."""
     channels = f" for each of {timing.channels} channels" if timing.channels > 1 else ""
-    yield f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the data decide)"
+    yield (f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the number depends on "
+           "the data)")
     rows = {"reading": timing.reading, "building the operator": timing.building,
-            "one iteration of NNLS": timing.nnls_iteration, "one iteration": timing.iteration,
+            "one NNLS iteration": timing.nnls_iteration, "one solver iteration": timing.iteration,
             "writing the images": timing.writing}
     for name, seconds in rows.items():
         yield f"  {name:<26}{seconds:10.3f} s"

@@ -1,4 +1,4 @@
-"""What the machine offers to this process."""
+"""Memory and cores that are available to this process."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def available_memory() -> int:
 
 
 def resident_memory() -> int:
-    """Bytes that this process holds now; where the kernel does not tell, the most that it ever held."""
+    """Bytes that this process uses now; where the kernel does not report it, the most that it has ever used."""
     try:
         return int((_PROC / "self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError, ValueError):

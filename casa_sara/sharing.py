@@ -1,4 +1,4 @@
-"""Visibilities that are spread over the ranks of a communicator: where they stand among all, and who gets what."""
+"""Visibilities that are spread over the ranks of a communicator: their positions among all, and their distribution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SERIES = ("ms", "observation", "field", "spw", "antenna1", "antenna2")
 
 @dataclass(frozen=True)
 class Crew:
-    """Who does what.
+    """The division of the work among the ranks.
 
     Attributes
     ----------

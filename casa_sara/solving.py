@@ -1,7 +1,9 @@
-"""The solution of one image within a run: sampling density, progress, limits of time, checkpoint, wild samples."""
+"""The solution of one image within a run: density of the uv coverage, progress, time limit, checkpoint, outliers."""
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -18,6 +20,7 @@ from casa_sara.reconstruction import reconstruct, schedule_of
 from casa_sara.sharing import ALONE
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.islands import STRUCTURE
+from casa_sara.solver.nnls import NNLS_ITERATIONS
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
 from casa_sara.timing import Pace
 from casa_sara.visibilities import clock
@@ -37,7 +40,7 @@ class Watch:
 
 
 def checkpoint_of(selection, grid, options, output):
-    """Return the checkpoint of a run, which knows the parameters that decide the model, by the names of the task.
+    """Return the checkpoint of a run, with the task parameters on which the model depends.
 
     Where the data are is none of them (they are known by their contents), nor is how many threads there are.
     """
@@ -59,7 +62,7 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     offsets : int (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1].
     noise : float (d,)
-        Measured in the data, in units of what the weights say; NaN where unknown.
+        Measured in the data, relative to the MS weights; NaN where unknown.
     selection : Selection or None
         That gave the data, for their sampling density; None where they are but a part of it.
     grid : ImageGrid
@@ -78,57 +81,111 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     -------
     Reconstruction
     """
-    density = sampling_density(data, selection, grid, crew.comm) if options.precondition else np.ones(data.size, np.float32)
     progress = log.Progress()
+    if options.precondition:
+        progress.prepare("computing the density of the uv coverage")
+        density = sampling_density(data, selection, grid, crew.comm)
+    else:
+        density = np.ones(data.size, np.float32)
     expected = schedule_of(options).expected_iterations
+    preparing = _Preparing(progress)
 
     def report(ppd, record):
+        preparing.over = True
         begun = record.resumed[-1] if record.resumed else 0
-        if watch and (words := watch.pace(ppd.iteration - begun)):
-            log.info(words)
+        if watch and (line := watch.pace(ppd.iteration - begun)):
+            log.info(line)
         fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-        progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
-                 f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
+        progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.block_sizes.sum()):.4g}, "
+                 f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
+                 f"{record.reweighting[-1]} re-weightings", fraction)
+
+    def stopped():
+        preparing()
+        return bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0])
 
     with stop_on_interrupt() as pressed:
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
-                                     lambda: bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0]),
-                                     checkpoint, support, crew)
+        if not (checkpoint and checkpoint.state is not None):
+            progress.prepare("computing the norm of the measurement operator, and the first image by non-negative least squares "
+                             f"(NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
+        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped, checkpoint,
+                                     support, crew)
     progress.close()
     record = reconstruction.record
     if record.stop_code == STOPPED_BY_USER and not crew.comm.broadcast(pressed()):
         record.stop_code = TIME_LIMIT
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
-    say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
+    samples = _samples_of_blocks(reconstruction, offsets, crew.comm)
+    say(f"{record.stop_description}, after {record.iteration[-1]} iterations and {record.reweighting[-1]} re-weightings: "
+        f"reduced chi-square {_reduced(record.residual_norm[-1], samples.sum()):.4g}, model flux "
+        f"{record.model_flux[-1]:.5g} Jy")
     if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
-        log.info(f"restart = True goes on from '{checkpoint.path}'")
+        log.info(f"restart = True continues from '{checkpoint.path}'")
     released = sum(update["released"] for update in record.reweightings)
     if released:
-        log.info(f"{released} pixels beside unresolved sources were allowed to be negative: the sources are between pixels")
+        log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie "
+                 "between pixel centres")
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
-        log.info(f"block {j}: l2 bound {bound:.5g}, residual {norm:.5g} (whitened)")
+        log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
+                 f"{_reduced(norm, samples[j]):.4g}")
     return reconstruction
 
 
+class _Preparing:
+    """The progress of the NNLS fit, which is asked after every iteration whether to stop.
+
+    Attributes
+    ----------
+    over : bool
+        The iterations of the solver have begun.
+    """
+
+    INTERVAL = 3.0  # s between two lines of the log
+
+    def __init__(self, progress, clock=time.monotonic):
+        self._progress, self._clock, self._iteration, self.over = progress, clock, 0, False
+        self._last = clock()
+
+    def __call__(self):
+        """Count one more iteration."""
+        if self.over:
+            return
+        self._iteration += 1
+        due = self._clock() - self._last >= self.INTERVAL
+        if due:
+            self._last = self._clock()
+        self._progress.prepare(f"NNLS iteration {self._iteration}", due)
+
+
+def _reduced(norm, samples):
+    """Return χ²/2M, the reduced chi-square of M complex samples, of the norm of their whitened residual."""
+    return float(norm) ** 2 / (2.0 * max(int(samples), 1))
+
+
+def _samples_of_blocks(reconstruction, offsets, comm):
+    """Return the number of samples in use of every block, int (d,), on all ranks together."""
+    return comm.sum(np.diff(np.searchsorted(reconstruction.kept, offsets)))
+
+
 def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):
-    """Leave out what the reconstruction left out, and say what that was."""
+    """Leave out the outliers that the reconstruction left out, and list them in the log."""
     wild = reconstruction.wild
     if not wild:
         return data, blocks
-    log.warn(f"{len(wild)} wild samples, which no sky explains, are left out:")
+    log.warn(f"{len(wild)} outliers, visibilities that no sky can explain, are left out:")
     for one in wild[:MOST_NAMED]:
         log.warn(f"  {one['ms']} row {one['row']}, spw {one['spw']}, channel {one['channel']}, antennas "
                  f"{one['antenna1']} and {one['antenna2']}, {clock(one['time_mjd_s'])}: {one['amplitude_jy']:.4g} Jy where "
-                 f"the image has {one['predicted_jy']:.4g} Jy")
+                 f"the model has {one['predicted_jy']:.4g} Jy")
     if len(wild) > MOST_NAMED:
-        log.warn(f"  … and {len(wild) - MOST_NAMED} more, in the record's 'wild'")
-    samples = comm.sum(np.diff(np.searchsorted(reconstruction.kept, offsets)))
+        log.warn(f"  … and {len(wild) - MOST_NAMED} more, which the record lists as 'wild'")
+    samples = _samples_of_blocks(reconstruction, offsets, comm)
     blocks = [replace(block, samples=int(count)) for block, count in zip(blocks, samples)]
     return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks
 
 
 def list_islands(record, plane, cell_rad, significance, comm=SERIAL):
-    """Give the islands of a model their places on the sky, list them in the log, and say whether the residual is noise.
+    """Give the islands of a model their sky coordinates, list them in the log, and warn where the residual is not noise.
 
     Parameters
     ----------
@@ -143,22 +200,35 @@ def list_islands(record, plane, cell_rad, significance, comm=SERIAL):
         Ranks that share the work.
     """
     record.islands = comm.once(located, record.islands, plane, cell_rad)
-    _tell(record, significance)
+    _log_islands(record, significance, cell_rad)
 
 
-def _tell(record, significance):
+def _log_islands(record, significance, cell_rad):
+    """Write the islands to the log, to a hundredth of a pixel, and warn where the residual is not noise."""
     if not record.residual_snr:
         return
-    islands = record.islands
-    if not islands:
+    islands = [island for island in record.islands if island["snr"] >= significance]
+    faint = [island["flux_jy"] for island in record.islands if island["snr"] < significance]
+    digits = max(0, 2 - math.floor(math.log10(math.degrees(min(cell_rad)) * 3600)))
+    if not record.islands:
         log.info(f"no emission of {significance:g} sigma or more: the model is empty")
     else:
         log.info(f"{len(islands)} islands of emission of {significance:g} sigma or more"
-                 + (f", the {MOST_TOLD} most significant:" if len(islands) > MOST_TOLD else ":"))
+                 + (f", the {MOST_TOLD} most significant:" if len(islands) > MOST_TOLD else ":" if islands else ""))
     for island in islands[:MOST_TOLD]:
-        log.info(f"  {island['right_ascension']} {island['declination']}: {island['flux_jy']:.4g} +- "
-                 f"{island['flux_error_jy']:.2g} Jy, S/N {island['snr']:.3g}, FWHM {island['fwhm_arcsec']:.3g} arcsec")
+        place = " ".join(_shortened(island[name], digits) for name in ("right_ascension", "declination"))
+        log.info(f"  {place}: {island['flux_jy']:.4g} +- {island['flux_error_jy']:.2g} Jy, S/N {island['snr']:.3g}, "
+                 f"FWHM {island['fwhm_arcsec']:.3g} arcsec")
+    if faint:
+        log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")
     worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"], default=None)
     if worst and worst["snr"] > STRUCTURE:
-        log.warn(f"the residual is not noise: it reaches {worst['snr']:.3g} sigma when smoothed to {worst['beams']:g} beams; "
-                 "calibration errors, emission outside the image, or emission that the model cannot hold")
+        log.warn(f"the residual image is not consistent with noise: smoothed to {worst['beams']:g} beams it reaches "
+                 f"{worst['snr']:.3g} sigma. Possible causes are calibration errors, emission outside the image, or emission "
+                 "that the model cannot represent")
+
+
+def _shortened(angle, digits):
+    """Return an angle as text, cut to so many decimal places."""
+    whole, point, decimals = angle.rpartition(".")
+    return whole + point + decimals[:digits] if digits else whole

@@ -1,4 +1,4 @@
-"""How long a run will take, from a short measurement of the real operators on the real data."""
+"""The expected time of a run, from a short measurement of the operators on the data."""
 
 from __future__ import annotations
 
@@ -136,12 +136,12 @@ class Pace:
         self.seconds = math.nan
 
     def __call__(self, iteration):
-        """Return what to say at the end of this iteration (from 1), '' where that is nothing."""
+        """Return a line for the log at the end of this iteration (from 1), '' for none."""
         if iteration == self.FIRST:
             self._start = self._clock()
         if iteration != self.LAST:
             return ""
         self.seconds = (self._clock() - self._start) / (self.LAST - self.FIRST)
         left = self._expected * self.seconds
-        return (f"forecast: {self.seconds:.3g} s per iteration, about {self._expected} iterations: "
-                f"{left:.0f} s from here")
+        return (f"forecast: {self.seconds:.3g} s per iteration and about {self._expected} iterations, so about "
+                f"{left:.0f} s from now")

@@ -11,11 +11,11 @@ __all__ = ["BlockInfo", "RowTable", "Visibilities", "clock", "sort_into_blocks"]
 
 @dataclass
 class RowTable:
-    """What is known of each MeasurementSet row that holds at least one sample, all (R,).
+    """The metadata of each MeasurementSet row with at least one sample, all (R,).
 
     `row` counts in its own MeasurementSet, `ms` numbers the MeasurementSets (in `vis`'s
     order), `time` is the middle of the integration in MJD seconds (UTC), `interval`
-    its length in seconds, and `hands` how many correlations a sample is formed of.
+    its length in seconds, and `hands` the number of correlations that a sample is formed of.
     """
 
     ms: np.ndarray
@@ -55,7 +55,7 @@ class Visibilities:
     dropped : dict
         Reason → number of samples that were left out.
     alone : dict
-        Correlation → number of samples that are of it alone, because the other hand has no weight.
+        Correlation → number of samples that are of it alone, because the other correlation has no weight.
     notes : list of str
         Warnings that the user must see, also in the record of the run.
     phase_center : dict
@@ -128,7 +128,7 @@ class Visibilities:
 
 @dataclass(frozen=True)
 class BlockInfo:
-    """What a snapshot block holds; `start` and `end` in MJD seconds."""
+    """The contents of a data block; `start` and `end` in MJD seconds."""
 
     ms_name: str
     observations: tuple[int, ...]

@@ -1,4 +1,4 @@
-"""The compiled kernels, loaded by a thread while CASA reads."""
+"""Loading of the compiled kernels in a thread while CASA reads."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Blocks by the user's words, and the blocks that are pointed out: against the columns of the data and the noise put in."""
+"""Blocks that the user selects, and the blocks that are pointed out: against the columns of the data and the noise put in."""
 
 import numpy as np
 import pytest
@@ -73,8 +73,8 @@ def test_entries_set_apart_what_they_name(vis, entries, expected):
 
 
 @pytest.mark.parametrize("entry, message", [
-    ("scan=99", "blocks = 'scan=99' names no sample that is imaged: should be a number, or a list of entries as"),
-    ("vis=7", "blocks = 'vis=7' names no sample"),
+    ("scan=99", "blocks = 'scan=99' selects no visibility that is imaged: should be a number, or a list of entries as"),
+    ("vis=7", "blocks = 'vis=7' selects no visibility"),
     ("antenna=nobody", "blocks = 'antenna=nobody': antenna = 'nobody' does not select from"),
 ])
 def test_entries_that_name_nothing_are_refused(vis, entry, message):
@@ -83,7 +83,7 @@ def test_entries_that_name_nothing_are_refused(vis, entry, message):
 
 
 def test_an_entry_inside_an_earlier_one_is_refused(vis):
-    with pytest.raises(ValueError, match="blocks = 'scan=1' names only samples that the entries before it have"):
+    with pytest.raises(ValueError, match="blocks = 'scan=1' selects only visibilities that earlier entries have selected"):
         divide(read(vis), ("vis=0~1 scan=1~2", "scan=1"))
 
 

@@ -178,10 +178,10 @@ def test_a_checkpoint_of_something_else_is_refused_with_the_difference(tmp_path)
     opened(path).identify(**data)
     for change, message in [
         (dict(version="2"), "another version of casa_sara: 1, and this is 2"),
-        (dict(parameters=dict(cell=(0.1, 0.1), niter=6)), "other parameters: niter was 5 and is 6.*Run as it was begun"),
+        (dict(parameters=dict(cell=(0.1, 0.1), niter=6)), "other parameters: niter was 5 and is 6.*Use the same data and parameters"),
         (dict(parameters=dict(cell=(0.1, 0.1), niter=5, regscale=2.0)), "regscale was None and is 2.0"),
     ]:
-        with pytest.raises(CheckpointError, match=f"restart = True: '{path}' cannot be resumed.*{message}"):
+        with pytest.raises(CheckpointError, match=f"restart = True: '{path}' cannot be continued.*{message}"):
             opened(path, **change)
     with pytest.raises(CheckpointError, match="other data: visibilities differ"):
         opened(path).identify(visibilities=np.array([0, 1, 2.5]), noise=None)
@@ -189,7 +189,7 @@ def test_a_checkpoint_of_something_else_is_refused_with_the_difference(tmp_path)
         opened(path).identify(visibilities=np.arange(3.0), noise=np.ones(1))
     for wrong in ({}, dict(version="1"), dict(version="1", parameters=7), HEADER | dict(data=3)):
         write(path, wrong, state())
-        with pytest.raises(CheckpointError, match="cannot be resumed"):
+        with pytest.raises(CheckpointError, match="cannot be continued"):
             opened(path).identify(**data)
 
 

@@ -5,6 +5,7 @@ import shutil
 import time
 from collections import namedtuple
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +26,7 @@ from casa_sara.casa.products import (
 )
 from casa_sara.casa.restore import fit_beam, restore, restoring_beam_words
 from casa_sara.options import ImageGrid, Output, Selection
+from casa_sara.solving import _Preparing
 
 ARCSEC = np.pi / 180 / 3600
 OFF_CENTRE = "J2000 19h59m40.5s +40d40m02s"
@@ -449,20 +451,35 @@ def test_messages_go_to_the_log(monkeypatch):
 
 @pytest.mark.parametrize("live", [False, True])
 def test_progress(monkeypatch, live):
-    lines, clock, stream = [], iter([0.0, 1.0, 65.0, 4000.0, 4001.0]), Terminal(live)
+    lines, clock, stream = [], iter([0.0, 1.0, 100.0, 101.0, 165.0, 170.0, 4000.0]), Terminal(live)
     monkeypatch.setattr(log, "info", lines.append)
     monkeypatch.setattr(time, "monotonic", lambda: next(clock))
     progress = log.Progress(interval=10, stream=stream)
-    progress(1, "a")
-    progress(10, "b", 0.5)
+    progress.prepare("first")
+    progress.prepare("second", log=False)
+    progress(1, "a", 0.1)
+    progress(10, "b", 0.5)  # 0.4 in 64 s: what came before the iterations does not count
     progress(11, "c", 0.6)
     progress(20, "d", 1.0)
     progress.close()
     assert lines == [
-        "iteration 1: a; 1 s",
-        "iteration 10: b; 1 min 05 s, about 1 min 05 s left",
-        "iteration 20: d; 1 h 06 min, about 0 s left",
+        "first; 1 s elapsed",
+        "iteration 1: a; 1 min 41 s elapsed",
+        "iteration 10: b; 2 min 45 s elapsed, about 1 min 20 s left",
+        "iteration 20: d; 1 h 06 min elapsed, about 0 s left",
     ]
-    assert stream.text.count("\r") == (4 if live else 0)
+    assert stream.text.count("\r") == (6 if live else 0)
     assert ("[############............] iteration 10" in stream.text) == live
     assert stream.text.endswith("\n" if live else "")
+
+
+def test_progress_of_the_first_image():
+    """A line in the log every 3 s, the live line at every iteration, and nothing once the solver iterates."""
+    calls, clock = [], iter([0.0, 1.0, 3.5, 3.6, 4.0])
+    progress = SimpleNamespace(prepare=lambda message, log: calls.append((message, log)))
+    preparing = _Preparing(progress, lambda: next(clock))
+    for _ in range(3):
+        preparing()
+    preparing.over = True
+    preparing()
+    assert calls == [("NNLS iteration 1", False), ("NNLS iteration 2", True), ("NNLS iteration 3", False)]

@@ -129,8 +129,8 @@ def test_samples_equal_a_cell_by_cell_read(tmp_path, correlations, hands):
     samples, counts = explicit_samples(name, hands)
     assert_same_samples(vis, samples)
     assert vis.dropped == counts and len(counts) == 7
-    assert any("unflagged samples cannot be used" in note for note in vis.notes)
-    assert any("alone: " in note for note in vis.notes) == (count == 1)
+    assert any("unflagged visibilities are not usable" in note for note in vis.notes)
+    assert any(" has only " in note for note in vis.notes) == (count == 1)
     assert bool(vis.alone) == any("alone, because the other" in note for note in vis.notes) == (len(hands) == 2)
 
 
@@ -395,9 +395,9 @@ def test_nothing_is_written_to_the_measurement_set(copied):
         ({"timerange": "junk", "spw": "0"}, "timerange = 'junk' does not select from"),
         ({"uvrange": "junk"}, "uvrange = 'junk' does not select from"),
         ({"intent": "CALIBRATE*"}, "intent = 'CALIBRATE.' does not select from"),
-        ({"scan": "77"}, "leaves nothing to image: scan = '77'"),
-        ({"timerange": ">2030/1/1"}, "leaves nothing"),
-        ({"field": "0", "scan": "2"}, "leaves nothing to image: field = '0', scan = '2'"),
+        ({"scan": "77"}, "selects no data: scan = '77'"),
+        ({"timerange": ">2030/1/1"}, "selects no data"),
+        ({"field": "0", "scan": "2"}, "selects no data: field = '0', scan = '2'"),
         ({"scan": ("1", "2")}, "scan = .* 2 entries for 1"),
         ({"datacolumn": "model"}, "datacolumn = 'model'"),
         ({"phasecenter": "somewhere"}, "phasecenter = 'somewhere'"),
@@ -445,9 +445,9 @@ def test_measurement_set_without_rows(observation, tmp_path):
 @pytest.mark.parametrize(
     ("col", "change", "message"),
     [
-        ("FLAG_ROW", np.ones_like, "no sample .* 1008 samples|no sample .* left out as flagged row"),
-        ("WEIGHT", np.zeros_like, "no sample .* left out as non-positive weight"),
-        ("UVW", lambda old: old * np.nan, "no sample .* left out as non-finite uvw"),
+        ("FLAG_ROW", np.ones_like, "no usable visibilities: .*1008 samples|no usable visibilities: .* left out as flagged row"),
+        ("WEIGHT", np.zeros_like, "no usable visibilities: .* left out as non-positive weight"),
+        ("UVW", lambda old: old * np.nan, "no usable visibilities: .* left out as non-finite uvw"),
         ("ANTENNA1", np.zeros_like, None),
     ],
 )
@@ -455,7 +455,7 @@ def test_nothing_usable(copied, col, change, message):
     edit(copied, col, change)
     if col == "ANTENNA1":
         edit(copied, "ANTENNA2", np.zeros_like)
-        message = "no sample .* left out as autocorrelation"
+        message = "no usable visibilities: .* left out as autocorrelation"
     with pytest.raises(ValueError, match=message):
         read(copied)
 

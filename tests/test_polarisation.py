@@ -102,9 +102,11 @@ def test_sources_of_either_sign_are_found_and_the_noise_too(observations, feed, 
 
 
 @pytest.mark.parametrize("given, message", [
-    (dict(stokes="Q"), "positivity = True does not go with stokes = 'Q', it may be negative: set positivity = False"),
-    (dict(stokes="U", positivity=False, savemodel="modelcolumn"), "savemodel = 'modelcolumn' does not go with stokes = 'U'"),
-    (dict(stokes="V", positivity=False, report=True), "report = True does not go with stokes = 'V'"),
+    (dict(stokes="Q"), "positivity = True is not possible with stokes = 'Q', the image may be negative: set positivity = "
+                       "False"),
+    (dict(stokes="U", positivity=False, savemodel="modelcolumn"),
+     "savemodel = 'modelcolumn' is not possible with stokes = 'U'"),
+    (dict(stokes="V", positivity=False, report=True), "report = True is not possible with stokes = 'V'"),
     (dict(stokes="Q", positivity=False, startmodel="i.model"), "startmodel = 'i.model' is of Stokes I: should be of Q"),
 ])
 def test_what_does_not_go_together_is_refused(observations, given, message):
@@ -119,7 +121,7 @@ def test_what_does_not_go_together_is_refused(observations, given, message):
     ("RL LR", "I", "RR and LL, or XX and YY, or one of them alone")])
 def test_missing_correlations_are_refused(tmp_path, correlations, stokes, right):
     name = simulate(tmp_path / "x.ms", correlations=correlations, antennas=4, scans=1)
-    with pytest.raises(ValueError, match=f"stokes = '{stokes}' cannot be formed from the correlations .*: it takes {right}"):
+    with pytest.raises(ValueError, match=f"stokes = '{stokes}' cannot be formed from the correlations .*: it needs {right}"):
         read_visibilities(Selection((name,), datacolumn="data"), stokes=stokes)
 
 

@@ -145,7 +145,7 @@ def test_single_product(tmp_path):
     assert {"measures", "sky", "residuals", "runs", "notes"} <= set(page.ids)
     assert not {"Similarity", "Differences", "Against the truth"} & set(page.titles)
     assert not any("Regions" in title for title in page.titles)
-    assert "S says how alike" not in page.text and "parameters that differ" not in page.text
+    assert "S measures how similar" not in page.text and "parameters that differ" not in page.text
     assert "Boxes are enlarged" in page.text  # the brightest peaks
 
 

@@ -209,7 +209,7 @@ def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, unint
     assert _hashes(path.parent) == before
     for bad in (good[:-1], good[:5000], good[:-20] + bytes([good[-20] ^ 4]) + good[-19:], b""):
         path.write_bytes(bad)
-        refused("cannot be resumed: it is (truncated|damaged|no checkpoint)")
+        refused("cannot be continued: it is (truncated|damaged|no checkpoint)")
         assert path.read_bytes() == bad
     path.write_bytes(good)
     assert _hashes(path.parent) == before

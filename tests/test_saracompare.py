@@ -534,7 +534,7 @@ def test_bad_parameters_raise_and_name_themselves(tmp_path, parameters, error, m
     (dict(inject="19h59m28.51s"), "inject = '19h59m28.51s' is not a position: should be right ascension"),
     (dict(inject="here there"), "inject = 'here there' is not a position"),
     (dict(inject="0deg 0deg"), "inject = '0deg 0deg' is outside the image"),
-    (dict(inject="19h59m28.51s +40d44m33.4s"), "inject = .* is outside of 'sara', or nearer to its edge than 2.5"),
+    (dict(inject="19h59m28.51s +40d44m33.4s"), "inject = .* is outside of 'sara', or closer to its edge than 2.5"),
     (dict(inject=EMPTY, models=["one", "one"]), "inject = .*needs vis, and images of tsara with their history"),
     (dict(injectflux=1.0), "injectflux = 1.0 has no effect without inject"),
 ])
@@ -562,10 +562,10 @@ def test_names_in_the_data_do_no_harm_in_the_report(tmp_path, vis):
 
 def test_an_image_without_a_beam_is_refused(tmp_path, vis):
     one = write(tmp_path / "one.model", sky())
-    with pytest.raises(ValueError, match="none of them has a beam"):
+    with pytest.raises(ValueError, match="none of them has an .image, .residual or .psf with a beam"):
         saracompare(models=[one, one])
     write(tmp_path / "one.residual", sky(), "Jy/beam")
-    with pytest.raises(ValueError, match="'.*one.residual' has no beam, nor has an image or PSF beside it: give vis"):
+    with pytest.raises(ValueError, match="'.*one.residual' has no beam, and there is no image or PSF with a beam: give vis"):
         saracompare(models=[one, one])
     assert saracompare(models=[one, one], vis=vis, datacolumn="data")["products"]["one"]["natural"]["dr"] > 10
     write(tmp_path / "one.psf", sky(), "", beam=BEAM)
@@ -575,13 +575,13 @@ def test_an_image_without_a_beam_is_refused(tmp_path, vis):
 def test_products_of_different_data_are_refused_without_vis(tmp_path, vis):
     one, *_ = product(tmp_path / "one", history=['vis = "a.ms"'])
     two, *_ = product(tmp_path / "two", history=["vis = ['run/b.ms', 'c.ms']"])
-    with pytest.raises(ValueError, match=r"'one' \(a.ms\) and 'two' \(b.ms, c.ms\) are made of different data"):
+    with pytest.raises(ValueError, match=r"'one' \(a.ms\) and 'two' \(b.ms, c.ms\) are made from different data"):
         saracompare(models=[one, two])
     jsonfile.save(one + ".sara.json", {"wild": [{"row": 5}]})
     comparison = compare_images(Comparing((one, two)), Selection((vis,), datacolumn="data"))
     assert comparison.measures["similarity"]["natural"] == {"one|two": np.inf}
-    assert "'two' was made of b.ms, c.ms, and is held against c.ms like the others" in comparison.notes
-    assert "1 wild samples that 'one' left out are in the residuals of all" in comparison.notes
+    assert "'two' was made from b.ms, c.ms, and is compared with c.ms like the others" in comparison.notes
+    assert "1 outliers that 'one' left out are included in the residuals of all" in comparison.notes
     three, *_ = product(tmp_path / "three", history=["vis = ['other/a.ms']"])
     assert saracompare(models=[one, three])["similarity"]["natural"] == {"one|three": np.inf}
 
@@ -599,7 +599,7 @@ def test_a_residual_that_does_not_cover_the_image_is_refused(tmp_path, vis):
 
 def test_pixels_too_coarse_for_the_visibilities_are_refused(tmp_path, vis):
     one = write(tmp_path / "one.model", sky((32, 32), [(1.0, 0, 0)]), cell=5.0)
-    with pytest.raises(ValueError, match="models.*pixels cannot be held against vis.*cell"):
+    with pytest.raises(ValueError, match="models.*visibilities cannot be computed for vis.*cell"):
         saracompare(models=[one, one], vis=vis, datacolumn="data")
 
 

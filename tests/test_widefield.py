@@ -186,15 +186,16 @@ def test_a_source_far_off_centre_is_recovered(run):
     assert pixels(name + ".model").sum() == pytest.approx(3.0, rel=0.03)
     assert all(block["noise_found"] < 1.2 for block in result["sara"]["blocks"])
     assert not any("w-term" in note for note in result["sara"]["notes"])
-    assert re.search(r"w-term: turns phases by up to 7\.1\d? rad in this image, modelled by a series of 1\d transforms", log)
-    assert "wprojplanes = 64: the w-term is exact" in log
+    assert re.search(r"w-term: changes phases by up to 7\.1\d? rad in this image, modelled by a series of 1\d Fourier "
+                     r"transforms", log)
+    assert "wprojplanes = 64: not used, the w-term is computed exactly" in log
     assert pixels(name + ".psf")[FIELD // 2, FIELD // 2] == pytest.approx(1, abs=1e-5)
     assert np.abs(pixels(name + ".residual")).max() < 6 * result["sara"]["chosen"]["noise_jy_per_beam"]
 
 
 def test_without_the_w_term_it_is_not(flat):
     result, name = flat
-    assert any("is not modelled: it turns phases by up to 7.1 rad" in note and "gridder = 'wproject'" in note
+    assert any("is not modelled: it changes phases by up to 7.1 rad" in note and "gridder = 'wproject'" in note
                for note in result["sara"]["notes"])
     assert abs(source(pixels(name + ".model"))[2] - 2) > 0.2
     assert max(block["noise_found"] for block in result["sara"]["blocks"]) > 3
@@ -256,7 +257,7 @@ def test_comparison_takes_the_w_term_into_the_residuals(run, flat, vis):
     comparison = compare_images(Comparing(names, ("wide", "flat")), selection)
     chi_square = {name: comparison.measures["products"][name]["natural"]["chi_square"] for name in ("wide", "flat")}
     assert max(chi_square["wide"]) < 1.3 and max(chi_square["flat"]) > 10
-    assert any("with the w-term, which turns phases by up to 7.1 rad in this image; 'flat' was imaged without it" in note
+    assert any("with the w-term, which changes phases by up to 7.1 rad in this image; 'flat' was imaged without it" in note
                for note in comparison.notes)
     alone = compare_images(Comparing(names[1:]), selection, single=True)
     assert not any("with the w-term" in note for note in alone.notes)
@@ -265,7 +266,7 @@ def test_comparison_takes_the_w_term_into_the_residuals(run, flat, vis):
 
 
 @pytest.mark.parametrize("parameters, message", [
-    (dict(gridder="wproject", wprojplanes=1), "wprojplanes = 1: would leave the w-term out"),
+    (dict(gridder="wproject", wprojplanes=1), "wprojplanes = 1 would leave the w-term out"),
     (dict(gridder="wproject", wprojplanes=0), "wprojplanes = 0"),
     (dict(gridder="wproject", wprojplanes=-2), "wprojplanes = -2: should be an integer, at least -1"),
     (dict(wprojplanes=16), "wprojplanes = 16 has no effect with gridder = 'standard'"),

@@ -1,4 +1,4 @@
-"""One part of the sky imaged with ever smaller pixels, as an animated picture."""
+"""An animation of one part of the sky imaged with different pixel sizes."""
 
 from __future__ import annotations
 

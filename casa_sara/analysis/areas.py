@@ -1,4 +1,4 @@
-"""Regions of the sky as masks: circles in plain words, CRTF and DS9 files or lines."""
+"""Regions of the sky as masks: circles given by coordinates and radius, CRTF and DS9 files or lines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers as text: tables whose columns share units, prefixes and decimals."""
+"""Numbers as text, in tables with common units, prefixes and decimals in each column."""
 
 from __future__ import annotations
 

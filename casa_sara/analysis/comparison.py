@@ -1,4 +1,4 @@
-"""What a comparison of images holds: the products on one grid, and the measures that were taken of them."""
+"""The data of a comparison of images: the products on one grid, and their measures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What tsara recorded of a run: how it converged, and how well each snapshot is calibrated."""
+"""Plots of the record of a run: its convergence, and the noise of each snapshot."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _norms(panel, record, end) -> None:
                    label="bounds of all blocks together")
     panel.set_yscale("log")
     panel.legend(fontsize=SMALL, frameon=False, loc="upper right")
-    panel.set_ylabel("norm, whitened")
+    panel.set_ylabel("norm of residual / noise")
     panel.yaxis.set_minor_formatter(panel.yaxis.get_major_formatter())
 
 
@@ -141,7 +141,7 @@ def block_noise(path, product) -> bool:
     else:
         axes[0, 0].set_ylim(0, 1.35 * max(values))
     for panel in axes[:, 0]:
-        panel.set_ylabel("noise, in units of the weights'", **TEXT)
+        panel.set_ylabel("noise relative to the MS weights", **TEXT)
     grey = {"ls": "", "marker": "o"}
     legend(figure, [Line2D([], [], mfc="white", mec="0.35", ms=5, label="measured: thermal noise", **grey),
                     Line2D([], [], color="0.35", ms=5.5, label="found: with calibration errors", **grey)])

@@ -1,4 +1,4 @@
-"""A folder of a report: the files of the next one take the place of the earlier one's, all together."""
+"""The folder of a report, in which the files of a new report replace those of an earlier one together."""
 
 from __future__ import annotations
 

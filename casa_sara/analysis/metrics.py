@@ -1,4 +1,4 @@
-"""How good an image is: the measures of Dabbech et al. (2018), comparisons with a truth, flux and resolution.
+"""Measures of image quality: those of Dabbech et al. (2018), comparison with a true sky, flux and resolution.
 
 All take plain arrays, indexed [ix, iy] with ix to the west and iy to the north.
 """

@@ -1,4 +1,4 @@
-"""What became of a point source: its flux, place and width in an image that holds nothing else."""
+"""Flux, position and width of a point source in an image without other emission."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report on a comparison: one HTML file that holds everything, and its pictures as PNG files beside it."""
+"""The report of a comparison: one self-contained HTML file, and its pictures as PNG files."""
 
 from __future__ import annotations
 

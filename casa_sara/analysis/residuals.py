@@ -1,4 +1,4 @@
-"""What is left in a residual image: its spread, its tails, and whether it is noise on all scales."""
+"""Statistics of a residual image: standard deviation, skewness, kurtosis, and whiteness."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ __all__ = ["radial_power_spectrum", "residual_statistics", "whiteness"]
 
 
 def residual_statistics(residual) -> dict[str, float]:
-    """Return what a residual image is like.
+    """Return the statistics of a residual image.
 
     Parameters
     ----------

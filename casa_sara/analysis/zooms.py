@@ -1,4 +1,4 @@
-"""Which parts of the sky are worth enlarging: the regions that were named, or else the brightest peaks."""
+"""The parts of the sky that a report enlarges: the given regions, or else the brightest peaks."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""All that talks to CASA's tools: data in, weights, images and model column out."""
+"""Everything that uses CASA's tools: reading data, weights, writing images and the model column."""

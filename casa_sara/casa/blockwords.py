@@ -1,4 +1,4 @@
-"""Blocks of data in the user's words: entries as 'scan=3' or 'vis=0 spw=1', in the syntax of the data selection."""
+"""Blocks of data that the user selects: entries as 'scan=3' or 'vis=0 spw=1', in the syntax of the data selection."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RIGHT = ("should be a number, or a list of entries as 'scan=3', 'spw=1', 'timera
 
 
 def divide(visibilities, blocks, comm=SERIAL):
-    """Split the samples into blocks: by snapshots, into a number of blocks, or after setting aside what the user names.
+    """Divide the samples into blocks: by snapshots, into a number of blocks, or separately for the selections of the user.
 
     The samples of an entry, and the rest, are split into snapshots each by itself. Where entries overlap the first has
     the samples.
@@ -48,17 +48,17 @@ def divide(visibilities, blocks, comm=SERIAL):
         found, refusals = _samples_of(visibilities, entry)
         if not comm.total(int(found.sum())):
             raise ValueError(f"blocks = '{entry}': {refusals[0]}" if refusals else
-                             f"blocks = '{entry}' names no sample that is imaged: {RIGHT}")
+                             f"blocks = '{entry}' selects no visibility that is imaged: {RIGHT}")
         found &= group == 0
         if not comm.total(int(found.sum())):
-            raise ValueError(f"blocks = '{entry}' names only samples that the entries before it have: leave it out, or set "
-                             "it first")
+            raise ValueError(f"blocks = '{entry}' selects only visibilities that earlier entries have selected: leave it "
+                             "out, or put it first")
         group[found] = number
     return snapshot_blocks(visibilities, group=group, comm=comm)
 
 
 def parsed(entry):
-    """Return the words of an entry: parameter → expression.
+    """Return the selection of an entry: parameter → expression.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def _numbers(entry, text):
 
 
 def _samples_of(visibilities, entry):
-    """Return which samples an entry names, bool (M,), and what the MeasurementSets said that do not know it."""
+    """Return which samples an entry selects, bool (M,), and the errors of MeasurementSets to which it does not apply."""
     words = parsed(entry)
     wanted = _numbers(entry, words.pop("vis")) if "vis" in words else list(visibilities.spws)
     rows, found, refusals = visibilities.rows, np.zeros(visibilities.size, bool), []

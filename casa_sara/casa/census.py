@@ -1,4 +1,4 @@
-"""How much a selection holds, told before it is read."""
+"""The number of visibilities of a selection and their range in uvw, counted before they are read."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ _START = "import sys; sys.path[:] = sys.argv[1:]; del sys.argv[1:]; from casa_sa
 
 
 class ChildError(RuntimeError):
-    """The child process could not do its job; the message is its last words."""
+    """The child process failed; the message is the last that it printed."""
 
 
 @contextmanager
@@ -96,7 +96,7 @@ def in_child(job: str, child: subprocess.Popen | None = None, **arguments: Any) 
 
 
 def _last_words(text, code):
-    """Return the error in what the child printed: CASA's own words, or the exception's."""
+    """Return the error in the output of the child: that of CASA, or the exception."""
     lines = [line.strip() for line in text.splitlines() if line.strip()]
     what = [line.removeprefix("what():").strip() for line in lines if line.startswith("what():")]
     how = signal.Signals(-code).name if code < 0 else f"exit code {code}"

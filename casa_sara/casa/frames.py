@@ -46,7 +46,7 @@ def image_direction(phasecenter, selected):
 
 
 def is_of_earth(direction):
-    """Tell whether the frame of a direction measure turns with the Earth, as azimuth and elevation do."""
+    """Return whether the frame of a direction measure rotates with the Earth, as azimuth and elevation do."""
     return direction["refer"] in _OF_EARTH
 
 
@@ -90,7 +90,7 @@ def _as_kept(direction):
 
 
 def _direction_of(phasecenter, first):
-    """Return the direction measure that `phasecenter` stands for, of fields of the SelectedMS `first`."""
+    """Return the direction measure of `phasecenter`, with fields of the SelectedMS `first`."""
     text = str(phasecenter).strip()
     if text == "":
         return first.fields[min(first.fields)]

@@ -1,4 +1,4 @@
-"""The image plane as tclean lays it out: coordinates, primary beam, and what an image says of its origin.
+"""The image plane as tclean defines it: coordinates, primary beam, and information about the observation.
 
 CASA's own synthesisimager makes them from the selected data, so they are tclean's by construction.
 """
@@ -203,7 +203,7 @@ def _make_primary_beam(visibilities, selection, grid, root, diameters=False):
             imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
         except RuntimeError as error:
             parameters = f"{_axes_words(grid)}, vis = {list(selection.vis)}"
-            raise ValueError(f"{parameters}: CASA makes no image of them: {' '.join(str(error).split())}") from error
+            raise ValueError(f"{parameters}: CASA cannot make an image of them: {' '.join(str(error).split())}") from error
         imager.makepb()
     finally:
         imager.done()
@@ -228,7 +228,7 @@ def _by_start(visibilities):
 
 
 def _selection_record(selection, number, diameters=False):
-    """Return one MeasurementSet's selection in synthesisimager's words."""
+    """Return the selection of one MeasurementSet as parameters of synthesisimager."""
     import casatools
 
     name = selection.vis[number]
@@ -244,7 +244,7 @@ def _selection_record(selection, number, diameters=False):
 
 
 def _image_record(visibilities, grid, root):
-    """Return the image definition in synthesisimager's words."""
+    """Return the image definition as parameters of synthesisimager."""
     center = visibilities.phase_center
     longitude, latitude = (float(center[axis]["value"]) for axis in ("m0", "m1"))
     return {

@@ -56,7 +56,7 @@ def write_image(name, pixels, plane, unit="", beam=None, masked=False):
 
 
 def _beam_record(beam):
-    """Return what an image's information says of its beam, or beams."""
+    """Return the record of the beam, or beams, in the information of an image."""
     if not isinstance(beam, (list, tuple)):
         return {"restoringbeam": beam} if beam else {}
     beams = {f"*{channel}": one for channel, one in enumerate(beam)}

@@ -1,4 +1,4 @@
-"""What one imager left under one root: the model, and beside it residual, beam, history and record."""
+"""The products of one imager with a common root: model, residual, beam, history and record."""
 
 from __future__ import annotations
 
@@ -52,17 +52,17 @@ class ImageSet:
 
     @property
     def data(self) -> set[str]:
-        """The MeasurementSets that the history names, without their folders; empty when it does not."""
+        """The MeasurementSets in the history, without their folders; empty if it has none."""
         return _data(self)
 
     @property
     def weighting(self) -> str:
-        """'natural', 'uniform' or 'briggs' as the history says, '' when it does not."""
+        """'natural', 'uniform' or 'briggs' according to the history, '' if it has no weighting."""
         return self.parameters.get("weighting", "")
 
 
 def read_image_set(given, name="", with_residual=True):
-    """Read what stands under one name.
+    """Read the products with one name.
 
     Parameters
     ----------
@@ -138,8 +138,8 @@ def check_same_data(sets):
     for other, data in others:
         if data != first[1]:
             pair = [f"'{one.name}' ({', '.join(sorted(names))})" for one, names in (first, (other, data))]
-            raise ValueError(f"models: {' and '.join(pair)} are made of different data, so their residuals cannot be "
-                             "compared: give vis, and all are held against the same visibilities")
+            raise ValueError(f"models: {' and '.join(pair)} are made from different data, so their residuals cannot be "
+                             "compared: give vis, from which all residuals are then made")
 
 
 def _model_path(given, parameter):

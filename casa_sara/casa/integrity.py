@@ -1,4 +1,4 @@
-"""Whether a MeasurementSet is one, and whole enough for CASA, which a broken one can hang or crash."""
+"""Checks that a MeasurementSet is complete, since an incomplete one can make CASA hang or crash."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _IDENTIFIERS = {"ANTENNA1": "ANTENNA", "ANTENNA2": "ANTENNA", "DATA_DESC_ID": "D
 
 @contextmanager
 def reading(name):
-    """Turn what CASA and Python say of an unreadable MeasurementSet into a ValueError that names `vis`."""
+    """Turn the errors of CASA and Python about an unreadable MeasurementSet into a ValueError that names `vis`."""
     try:
         yield
     except (RuntimeError, UnicodeDecodeError, SystemError) as error:
@@ -39,7 +39,7 @@ def reading(name):
 
 
 def check_measurement_set(name):
-    """Raise unless `name` is a MeasurementSet with rows, whose numbers CASA survives.
+    """Raise unless `name` is a MeasurementSet with rows, whose numbers do not make CASA crash.
 
     msmetadata ends the process at a frequency that is no number, and never returns from such a time. Subtables with
     something wrong are set right in a copy (:func:`casa_sara.casa.subtables.readable`), or refused where all is wrong.
@@ -73,7 +73,7 @@ def check_measurement_set(name):
 
 
 def _check_columns(tb, name):
-    """Raise unless the columns of the main table are what CASA asks of a MeasurementSet."""
+    """Raise unless the columns of the main table are those that CASA requires."""
     there = tb.getdesc()
     for kind, column in [(kind, one) for kinds in (_REQUIRED, _OPTIONAL) for kind, names in kinds.items() for one in names]:
         if column not in there:

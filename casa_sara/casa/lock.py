@@ -1,4 +1,4 @@
-"""One run at a time under one name: `<imagename>.lock`, held for as long as the run lasts."""
+"""The lock `<imagename>.lock`, which allows only one run at a time under one name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _KEYS = {"pid", "host", "since"}
 
 @contextmanager
 def one_run_of(imagename):
-    """Keep all other runs off this name, those of this process too, until the end.
+    """Lock this name against all other runs, those of this process too, until the end.
 
     The lock is `flock` on a file that says which process holds it. The kernel gives it back when that
     process ends, however it ends, so the file that a killed run leaves locks nothing. On a file system
@@ -50,14 +50,14 @@ def one_run_of(imagename):
 
 
 def _take(path, imagename):
-    """Return the locked file, opened, which is the one that stands at this path."""
+    """Return the opened and locked file that is at this path."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             _lock(handle, imagename)
             if os.fstat(handle).st_size and not _said(handle):
-                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is no lock of tsara and in "
-                                      "its way; move it, or choose another name")
+                raise FileExistsError(errno.EEXIST, f"imagename = '{imagename}': '{path}' is not a lock file of tsara; "
+                                      "move it, or choose another name")
             if _stands(handle, path):
                 return handle
         except BaseException:
@@ -75,7 +75,7 @@ def _stands(handle, path):
 
 
 def _lock(handle, imagename):
-    """Lock the opened file, or say who holds it."""
+    """Lock the opened file, or raise with the holder of the lock."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -83,17 +83,17 @@ def _lock(handle, imagename):
         who = "process {pid} on {host}, since {since}," if holder else "another run, which has just started,"
         raise BlockingIOError(
             errno.EWOULDBLOCK, f"imagename = '{imagename}': {who.format_map(holder)} is writing under this name; wait "
-            "for its end, or choose another name"
+            "until it has finished, or choose another name"
         ) from None
     except OSError as error:
         if error.errno not in _WITHOUT_LOCKS:
             raise
-        log.warn(f"imagename = '{imagename}': the file system has no locks ({error.strerror}): do not start another "
-                 "run under this name")
+        log.warn(f"imagename = '{imagename}': the file system does not support locks ({error.strerror}): do not start another "
+                 "run under this name at the same time")
 
 
 def _said(handle):
-    """Return what a lock file says of its holder, {} where it does not."""
+    """Return the holder that a lock file names, {} if it names none."""
     try:
         holder = json.loads(os.pread(handle, 4096, 0))
     except ValueError:

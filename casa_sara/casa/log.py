@@ -1,4 +1,4 @@
-"""The CASA log: the same file and the same words as the CASA tasks.
+"""The CASA log: the same file and the same format as those of the CASA tasks.
 
 INFO goes to the log file; CASA itself shows WARN and worse on the terminal too.
 """
@@ -16,7 +16,7 @@ _silent = False  # this process is one of several, and another one speaks
 
 
 def speak(speaks):
-    """Say whether this process writes to the log, and draws progress."""
+    """Set whether this process writes to the log and draws progress."""
     global _silent
     _silent = not speaks
 
@@ -58,7 +58,7 @@ def error(message):
 
 
 class Progress:
-    """Progress of an iteration: a line in the log now and then, and a live bar in a terminal.
+    """Progress of a reconstruction: lines in the log, and a live bar in a terminal.
 
     Parameters
     ----------
@@ -75,24 +75,47 @@ class Progress:
         self._stream = sys.stderr if stream is None else stream
         self._live = self._stream.isatty() and not _silent
         self._start = time.monotonic()
+        self._first = None  # time and fraction at the end of the first iteration
 
     def __call__(self, iteration, message, fraction=None):
-        """Tell where iteration number `iteration` (from 1) stands.
+        """Report the state after iteration number `iteration` (from 1).
+
+        The time left follows from the iterations since the first one: what came before them, and the
+        start of the first, are not repeated.
 
         Parameters
         ----------
         iteration : int
         message : str
         fraction : float, optional
-            Estimate of how much of the work is done, 0 to 1, from which the time left follows.
+            Estimate of the part of the iterations that is done, 0 to 1.
         """
-        elapsed = time.monotonic() - self._start
-        left = f", about {_spell(elapsed * (1 / fraction - 1))} left" if fraction else ""
-        line = f"iteration {iteration}: {message}; {_spell(elapsed)}{left}"
+        now, fraction = time.monotonic(), fraction or 0.0
+        begin, done = self._first = self._first or (now, fraction)
+        left = f", about {_spell((now - begin) * (1 - fraction) / (fraction - done))} left" if fraction > done else ""
+        line = f"iteration {iteration}: {message}; {_spell(now - self._start)} elapsed{left}"
         if iteration == 1 or iteration % self._interval == 0:
             info(line)
+        self._draw(line, fraction)
+
+    def prepare(self, message, log=True):
+        """Report what is done before the first iteration.
+
+        Parameters
+        ----------
+        message : str
+        log : bool
+            Write it to the log too, not to the terminal only.
+        """
+        line = f"{message}; {_spell(time.monotonic() - self._start)} elapsed"
+        if log:
+            info(line)
+        self._draw(line, 0.0)
+
+    def _draw(self, line, fraction):
+        """Draw the bar, where there is a terminal."""
         if self._live:
-            filled = round(self.WIDTH * min(fraction or 0, 1))
+            filled = round(self.WIDTH * min(fraction, 1))
             self._stream.write(f"\r[{'#' * filled}{'.' * (self.WIDTH - filled)}] {line}\033[K")
             self._stream.flush()
 

@@ -97,7 +97,7 @@ def _check_space(name, count):
 
 
 def incomplete_columns(vis):
-    """Return which of these MeasurementSets hold a model column that a killed run left half written."""
+    """Return which of these MeasurementSets have an incomplete model column of a killed run."""
     return [name for name in vis if os.path.exists(os.path.join(name, INCOMPLETE))]
 
 
@@ -118,7 +118,7 @@ def _column_bytes(name):
 def write_model_column(selection, phase_center, predict):
     """Fill MODEL_DATA of the selected rows and channels, flagged ones too.
 
-    The model visibility is the same for both parallel hands (unpolarised) and 0 for cross-hands.
+    The model visibility is the same for both parallel-hand correlations (unpolarised) and 0 for cross-hand ones.
     Any model kept in the header (usescratch=False) is deleted, so that it does not go first.
     A column that is there keeps what it holds outside the selection; a new one holds
     CASA's default of 1 there. SIGINT and SIGTERM wait until the column is whole and has been read back.
@@ -153,7 +153,7 @@ def _mark(name):
     since = datetime.now(timezone.utc).isoformat(" ", "seconds")
     Path(name, INCOMPLETE).write_text(
         f"Process {os.getpid()} on {socket.gethostname()} began to write {_COLUMN} at {since}. Where it has ended, the "
-        "column is incomplete: tsara with restart=True, niter=0, savemodel='modelcolumn' writes it anew.\n",
+        "column is incomplete: tsara with restart=True, niter=0, savemodel='modelcolumn' writes it again.\n",
         encoding="utf-8")
 
 
@@ -212,7 +212,7 @@ def _clear_away(name, files, description):
 
 
 def _held_open(name):
-    """Return whether this process has files of a MeasurementSet open, as far as the system tells."""
+    """Return whether this process has files of a MeasurementSet open, as far as the system reports it."""
     folder, files = os.path.realpath(name) + os.sep, "/proc/self/fd"
     opened_files = os.listdir(files) if os.path.isdir(files) else ()
     return any(os.path.realpath(os.path.join(files, file)).startswith(folder) for file in opened_files)
@@ -257,7 +257,7 @@ def _write(ms, geometry, predict):
 
 
 def _parallel(group):
-    """Return where the parallel hands stand among the correlations."""
+    """Return the positions of the parallel-hand correlations."""
     return [k for k, name in enumerate(group.correlations) if name in ("I", "RR", "LL", "XX", "YY")]
 
 
@@ -268,7 +268,7 @@ def _at_field_centre(predict, freq_hz, uvw, shift):
 
 
 def _read_back(ms):
-    """Yield the pieces as they stand on disk."""
+    """Yield the pieces as they are on disk."""
     with opened("table", ms.name) as tb:
         for group, rows in _pieces(ms):
             part = tb.selectrows(rows.tolist())

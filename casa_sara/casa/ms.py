@@ -38,25 +38,25 @@ _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw"
 def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, crew=ALONE):
     """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
 
-    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel hand there is, and as tclean (of circular, or of linear
-    feeds)
+    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel-hand correlation there is, and as tclean (of circular, or
+    of linear feeds)
 
         V_Q = (V_RL + V_LR)/2,  (V_XX − V_YY)/2;    V_U = (V_RL − V_LR)/2i,  (V_XY + V_YX)/2;
         V_V = (V_RR − V_LL)/2,  (V_XY − V_YX)/2i;
 
-    where the Stokes parameter itself is stored, it is taken as it stands.
+    where the Stokes parameter itself is stored, it is used as it is.
 
     A sample is left out when any of its correlations is flagged (cross-hands too, as in tclean), when its row is flagged or
     an autocorrelation, and when data, weights or uvw cannot be used; what was left out is counted by the first reason that
     applies. Weights are, row by row, WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the data column (as in tclean).
-    Where one parallel hand has no weight (0, negative or NaN), Stokes I is the other one, with its weight; tclean takes the
-    mean of both there.
+    Where one parallel-hand correlation has no weight (0, negative or NaN), Stokes I is the other one, with its weight;
+    tclean takes the mean of both there.
 
-    The inverse variance of Re V_I and of Im V_I follows from those of the hands:
+    The inverse variance of Re V_I and of Im V_I follows from those of the correlations:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
     WEIGHT = 1/SIGMA² with SIGMA the scatter of the real and of the imaginary part. The same holds for Q, U and V of
     theirs. tclean's imaging weight is the mean of those of the first and the last correlation, in the order of the
-    MeasurementSet and whatever the Stokes parameter: of RR, RL, LR, LL the mean of the parallel hands.
+    MeasurementSet and whatever the Stokes parameter: of RR, RL, LR, LL the mean of RR and LL.
 
     The MeasurementSets are opened read-only and stay as they are, byte by byte.
 
@@ -64,7 +64,7 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     ----------
     selection : casa_sara.options.Selection
     phasecenter : str or int
-        Image centre in tclean's words; '' is the first selected field's.
+        Image centre, as in tclean; '' is that of the first selected field.
     stokes : str
         'I', 'Q', 'U' or 'V'.
     frequencies : bool
@@ -93,12 +93,12 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     data = table.usable_visibilities(comm)
     usable, size = table.usable, comm.total(data.size)
     rows_of = comm.sum(np.bincount(data.rows.ms, minlength=len(selection.vis)))
-    unused = [f"no sample of '{ms.name}' can be used: nothing of it is imaged" for ms in selected if not rows_of[ms.number]]
+    unused = [f"'{ms.name}' has no usable visibilities and is not imaged" for ms in selected if not rows_of[ms.number]]
     if size == 0:
-        raise ValueError(f"vis: no sample of {', '.join(selection.vis)} can be used: {_counts(usable.dropped)}")
+        raise ValueError(f"vis: {', '.join(selection.vis)} has no usable visibilities: {_counts(usable.dropped)}")
     if usable.strongest < SMALLEST:
-        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {size} samples of "
-                         f"{', '.join(selection.vis)} that can be used are zero: it may never have been filled")
+        raise ValueError(f"datacolumn = '{selection.datacolumn}': all {size} usable visibilities of "
+                         f"{', '.join(selection.vis)} are zero: the column may never have been filled")
     return replace(
         data,
         ms_names=tuple(selection.vis),
@@ -149,7 +149,7 @@ def _pieces(group):
 
 @dataclass
 class _Chunk:
-    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each hand, `weighing` tclean's two weights.
+    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each correlation, `weighing` tclean's two weights.
 
     `either` is that of the RowGroup; `undefined` says of which rows (bool (R,)) a cell of DATA, FLAG or WEIGHT is not there.
     """
@@ -265,13 +265,13 @@ class _SampleTable:
 
 
 def _formed(chunk, group, ok, weighted):
-    """Return the Stokes parameter of the samples that are `ok` and its inverse variance, and where it is of one hand alone.
+    """Return the Stokes parameter of the samples that are `ok` and its inverse variance, and where it is one correlation alone.
 
     Returns
     -------
     vis, weight : (M,)
     alone : list of bool (M,)
-        For each hand, where it alone has a weight.
+        For each correlation, where it alone has a weight.
     """
     vis, weight = ([hand[ok] for hand in hands] for hands in (chunk.vis, chunk.weight))
     if len(vis) == 1:
@@ -285,7 +285,7 @@ def _formed(chunk, group, ok, weighted):
 
 
 def _imaging_weight(weighing, alone, otherwise):
-    """Return the mean of tclean's two weights, and what the noise says, `otherwise`, where one of them cannot be used."""
+    """Return the mean of tclean's two weights, or `otherwise`, the weight by the noise, where one of them is not usable."""
     unusable = np.any([*alone, *(~(weight >= LIGHTEST) for weight in weighing)], axis=0)
     return np.where(unusable, otherwise, sum(weighing) / len(weighing))
 
@@ -311,19 +311,20 @@ def _counts(dropped):
 
 
 def _notes(selected, usable):
-    """Return the warnings that the data themselves give rise to."""
-    notes = [f"{count} samples are of {name} alone, because the other hand has no weight: {UNPOLARISED}"
+    """Return warnings about the data."""
+    notes = [f"{count} samples use {name} alone, because the other correlation has no weight: {UNPOLARISED}"
              for name, count in usable.alone.items()]
     unusable = {reason: count for reason, count in usable.dropped.items() if reason not in IN_FLAGS}
     if unusable:
-        notes.append(f"unflagged samples cannot be used: {_counts(unusable)}")
-    notes += [f"field {number} of '{ms.name}' is in {direction['refer']}: it is followed on the sky, integration by integration"
+        notes.append(f"unflagged visibilities are not usable: {_counts(unusable)}")
+    notes += [f"field {number} of '{ms.name}' is in {direction['refer']}: its direction on the sky is "
+              "computed for every integration"
               for ms in selected for number, direction in ms.fields.items() if is_of_earth(direction)]
     centres = [on_sky(direction, ms, ms.start_s) for ms in selected for direction in ms.fields.values()]
     spread = max(separation(centre, centres[0]) for centre in centres)
     if spread > _ONE_POINTING:
         notes.append(
             f"{len(centres)} fields, up to {np.degrees(spread) * 3600:.1f} arcsec apart, are imaged as one pointing: "
-            "primary beams are not taken into account"
+            "their different primary beams are not modelled"
         )
     return notes

@@ -1,4 +1,4 @@
-"""CASA's selection parser (MSSelection, the one behind tclean), with its answers made plain."""
+"""CASA's selection parser (MSSelection, which tclean uses), with clear errors."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _rows_with_channels(name, rows, channels):
 
 
 def _raise_bad_expression(name, strings):
-    """Find the parameter that the parser did not understand: it selects all rows and says False."""
+    """Find the parameter that the parser did not understand: it selects all rows and returns False."""
     for parameter, value in strings.items():
         with opened("ms", readable(name)) as tool:
             if tool.msselect({MSSELECT_KEYS[parameter]: value}) or tool.nrow(True) == 0:

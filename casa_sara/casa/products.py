@@ -39,13 +39,13 @@ RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by 
 
 
 def existing_products(imagename):
-    """Return the paths of the products that stand under this name."""
+    """Return the paths of the existing products of this name."""
     return [imagename + suffix for suffix in (*PRODUCTS, *ON_REQUEST, RECORD, REPORT)
             if os.path.lexists(imagename + suffix)]
 
 
 def remove_products(imagename):
-    """Remove the products that stand under this name."""
+    """Remove the existing products of this name."""
     for path in existing_products(imagename):
         shutil.rmtree(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
 
@@ -105,13 +105,13 @@ def new_products(imagename):
 
 
 def recover_products(imagename):
-    """Finish, or clear away, what a run under this name left that was killed while it wrote its products."""
+    """Complete or remove the products of a run of this name that was killed while it wrote them."""
     shutil.rmtree(_folder_of(imagename, ".new"), ignore_errors=True)
     _take_places(imagename)
 
 
 def _take_places(imagename):
-    """Replace the products by those in '.whole', or go on with it."""
+    """Replace the products by those in '.whole', or continue an interrupted replacement."""
     whole, moving, old = (_folder_of(imagename, stage) for stage in (".whole", ".moving", ".old"))
     if os.path.isdir(whole):  # what stands under the name is older
         os.makedirs(old, exist_ok=True)
@@ -194,7 +194,7 @@ def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor
 
 
 def _not_written(imagename, needed, scratch, error):
-    """Return the error that says why the images were not written: a full disk, or in CASA's words."""
+    """Return the error why the images were not written: a full disk, or the error of CASA."""
     folder, free = os.path.dirname(imagename) or ".", shutil.disk_usage(scratch).free
     written = sum(os.lstat(os.path.join(parent, name)).st_blocks * 512
                   for parent, _, names in os.walk(scratch) for name in names)

@@ -1,4 +1,4 @@
-"""Numbers with units out of task parameters."""
+"""Numbers with units in task parameters."""
 
 from __future__ import annotations
 

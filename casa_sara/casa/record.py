@@ -1,4 +1,4 @@
-"""The record that tsara leaves beside its images, read by those who did not write it."""
+"""Reading and checking the record that tsara writes with its images."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _OF_BLOCK = ("samples", "start_mjd_s", "end_mjd_s", "noise_found", "noise_measur
 
 
 def read_record(path: str | os.PathLike) -> dict[str, Any]:
-    """Read a record and check what the comparison and the report take from it.
+    """Read a record and check the entries that the comparison and the report use.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Which rows, channels and correlations of the MeasurementSets are wanted, and whether they can be had.
+"""The rows, channels and correlations that are selected from the MeasurementSets, and checks of them.
 
 The selection strings go to CASA's own parser (MSSelection, the one behind tclean), so they
 mean here what they mean there. Everything that can be wrong with the input is said here,
@@ -45,7 +45,7 @@ class RowGroup:
     channels : int64 (C,), selected channel numbers, increasing
     freqs_hz, widths_hz : float64 (C,), centres and widths in `frame`
     frame : str, reference of the frequencies ('TOPO', 'LSRK', …)
-    hands : tuple of one or two int, where the correlations stand that form the Stokes parameter; () where none was asked for
+    hands : tuple of one or two int, the positions of the correlations that form the Stokes parameter; () without one
     sign, divisor : it is (first + sign·second)/divisor
     either : bool, whether one of the two will do where the other has no weight, as if the source were unpolarised
     weighing : tuple of int, the first correlation and the last: tclean's imaging weight is the mean of theirs
@@ -84,7 +84,7 @@ class RowGroup:
 
 @dataclass(frozen=True)
 class SelectedMS:
-    """One MeasurementSet with what is selected of it.
+    """One MeasurementSet and the selected part of it.
 
     Attributes
     ----------
@@ -140,12 +140,12 @@ def select_data(selection, stokes=""):
             column = _data_column(name, selection.datacolumn, notes)
             selected.append(_describe(number, name, column, rows, (channels, stokes), notes))
     if not selected:
-        raise ValueError("the data selection leaves nothing to image: " + "; ".join(empty))
-    return selected, notes + [f"{reason}: nothing of it is imaged" for reason in empty]
+        raise ValueError("the data selection selects no data: " + "; ".join(empty))
+    return selected, notes + [f"{reason}, so nothing of it is imaged" for reason in empty]
 
 
 def _check_parameters(selection):
-    """Raise on what can be seen without opening anything."""
+    """Raise on errors that are found without opening a MeasurementSet."""
     if not selection.vis:
         raise ValueError("vis is empty: it takes the name of a MeasurementSet, or a list of names")
     if selection.datacolumn not in _DATA_COLUMNS:
@@ -241,7 +241,7 @@ def _with_lacking(name, column, groups):
 
 
 def _position(md, observation):
-    """Return where the telescope stands: its first antenna if CASA does not know the name, as in tclean."""
+    """Return the position of the telescope: that of its first antenna if CASA does not know the name, as in tclean."""
     try:
         return md.observatoryposition(observation)
     except RuntimeError:
@@ -261,7 +261,7 @@ def _formation(name, spw, codes, stokes, notes):
                         weighing=weighing)
     parallel = [number for number, code in enumerate(codes) if code in _PARALLEL]
     if stokes == "I" and parallel:
-        note = f"'{name}' holds {_STOKES_CODES[codes[parallel[0]]]} alone: {UNPOLARISED}"
+        note = f"'{name}' has only {_STOKES_CODES[codes[parallel[0]]]}: {UNPOLARISED}"
         if note not in notes:
             notes.append(note)
         return alone | dict(hands=(parallel[0],))
@@ -270,7 +270,7 @@ def _formation(name, spw, codes, stokes, notes):
     names = ", ".join(_STOKES_CODES.get(code, f"type {code}") for code in codes)
     ways = ", or ".join(f"{_STOKES_CODES[first]} and {_STOKES_CODES[second]}" for first, second, *_ in _FORMED[stokes])
     raise ValueError(
-        f"stokes = '{stokes}' cannot be formed from the correlations {names} of spw {spw} in '{name}': it takes {ways}"
+        f"stokes = '{stokes}' cannot be formed from the correlations {names} of spw {spw} in '{name}': it needs {ways}"
         f"{', or one of them alone' if stokes == 'I' else ''}, or {stokes} itself; other spws can be selected with spw"
     )
 

@@ -246,7 +246,8 @@ def _check_plane(name, parameter, shape, csys):
         raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one channel")
     stokes = csys.stokes() if csys.findcoordinate("stokes")["return"] else ["I"]
     if stokes[0] in ("Q", "U", "V"):
-        raise ValueError(f"{parameter} = '{name}' is of Stokes {stokes[0]}: should be of Stokes I, which it is held against")
+        raise ValueError(f"{parameter} = '{name}' is of Stokes {stokes[0]}: should be of Stokes I, as what it is "
+                         "compared with")
 
 
 def beam_numbers(record):

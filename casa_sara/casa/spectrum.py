@@ -1,4 +1,4 @@
-"""The spectral index that the user knows of: a number, or an image of it."""
+"""The known spectral index: a number, or an image of it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def check_spectral_index(text):
     """Raise unless `text` is '', a number within ±5, or the name of an image that exists."""
     value = _number(text)
     if value is None and text and not os.path.exists(text):
-        raise FileNotFoundError(f"spectralindex = '{text}' is neither a number nor an image that exists: it takes the "
+        raise FileNotFoundError(f"spectralindex = '{text}' is neither a number nor an image that exists: should be the "
                                 "exponent of the frequency, as '-0.7', or an image of it")
     if value is not None and not abs(value) <= LARGEST_INDEX:
         raise ValueError(f"spectralindex = '{text}': should be from {-LARGEST_INDEX:g} to {LARGEST_INDEX:g}, the exponent "
@@ -29,7 +29,7 @@ def check_spectral_index(text):
 
 
 def with_spectrum(grid, plane, reference=None):
-    """Return the grid with the spectrum that its `spectralindex` stands for.
+    """Return the grid with the spectrum given by its `spectralindex`.
 
     Parameters
     ----------
@@ -88,7 +88,7 @@ def _index_image(name, plane):
     with opened_image(name) as ia:
         good = read_pixels(ia, getmask=True)
     if not good.any() or not image.overlaps(plane):
-        raise ValueError(f"spectralindex = '{name}' has no good pixel in the image: should show the same sky")
+        raise ValueError(f"spectralindex = '{name}' has no valid pixel in the image: should cover the same part of the sky")
     low, high = float(image.pixels[good].min()), float(image.pixels[good].max())
     if max(-low, high) > LARGEST_INDEX:
         raise ValueError(f"spectralindex = '{name}' has values from {low:.3g} to {high:.3g}: should be from "

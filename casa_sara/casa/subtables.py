@@ -1,10 +1,10 @@
-"""The subtables of a MeasurementSet: what is wrong in them, and a copy that CASA survives.
+"""The subtables of a MeasurementSet: a check of their cells, and corrected copies for CASA.
 
-One number that is none, one empty cell or one letter that is not UTF-8, be it in a row that no data refer to, and CASA
-refuses the whole MeasurementSet, never returns, or ends the process. The table tool reads all of them, so the subtables are
-looked at here first. Where something is wrong, CASA's other tools are shown a folder in its place, with links to the files
-of the MeasurementSet and a copy of the subtables that are wrong, set right. What the image depends on is refused
-when selected data refer to it; the MeasurementSet stays as it is.
+A single number that is not finite, an empty cell or a character that is not UTF-8, even in a row that no data refer to, makes
+CASA refuse the whole MeasurementSet, hang, or end the process. The table tool can read all of them, so the subtables are
+checked here first. Where a cell is wrong, CASA's other tools are given a folder with links to the files of the
+MeasurementSet and corrected copies of the subtables in question. A wrong cell on which the image depends is an error
+when selected data refer to it. The MeasurementSet itself is not changed.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class _Rule(NamedTuple):
     """
 
     column: str
-    words: str
+    words: str  # what the cell should hold, for the error message
     right: Callable[[np.ndarray, dict, dict], Any]
     instead: Callable[[dict], Any] | None = None
 
@@ -166,7 +166,7 @@ class _Subtables:
     folders: dict[bool, tempfile.TemporaryDirectory] = field(default_factory=dict)
 
     def path(self, diameters: bool) -> str:
-        """Return what CASA is shown."""
+        """Return the path that CASA is given."""
         repairs = _with_diameters(self) if diameters else self.repairs
         if not repairs:
             return self.name
@@ -179,7 +179,7 @@ _known: dict[str, tuple[tuple, _Subtables]] = {}
 
 
 def readable(name, diameters=False):
-    """Return the path of a MeasurementSet that every tool of CASA can read: `name` itself, unless its subtables are wrong.
+    """Return the path of a MeasurementSet that all tools of CASA can read: `name` itself, unless its subtables are wrong.
 
     Parameters
     ----------
@@ -196,7 +196,7 @@ def readable(name, diameters=False):
 
 
 def check_rows(name, **rows):
-    """Raise unless these rows of the subtables hold what an image can be made of.
+    """Raise unless the cells of these rows of the subtables are valid for imaging.
 
     Parameters
     ----------
@@ -236,7 +236,7 @@ def _bearable(text):
 
 
 def _subtables(name):
-    """Return what is known of the subtables of a MeasurementSet, found again when one of its files has changed."""
+    """Return the checked subtables of a MeasurementSet, checked again when one of its files has changed."""
     key, state = os.path.realpath(name), _state(name)
     if key not in _known or _known[key][0] != state:
         _known[key] = state, _examined(name)
@@ -341,7 +341,7 @@ def _with_diameters(found):
 
 
 def _shown(name, repairs):
-    """Return a temporary folder with links to the MeasurementSet, and a copy of what is wrong, set right."""
+    """Return a temporary folder with links to the MeasurementSet and corrected copies of the wrong subtables."""
     folder = tempfile.TemporaryDirectory(prefix="casa_sara_")
     source = os.path.realpath(name)
     shown = os.path.join(folder.name, os.path.basename(source))

@@ -1,4 +1,4 @@
-"""The support of the model: where the user, or the primary beam, lets it be other than zero, as tclean makes a mask."""
+"""The support of the model: the pixels that the user's mask or the primary beam allows to be non-zero, as in tclean."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ def read_support(grid, plane):
     if grid.usemask == "pb":
         support = plane.pb > grid.pbmask
         if not support.any():
-            raise ValueError(f"usemask = 'pb', pbmask = {grid.pbmask:g}: the primary beam is nowhere in the image above it: "
-                             "should be less, or the image nearer to the pointing centre")
+            raise ValueError(f"usemask = 'pb', pbmask = {grid.pbmask:g}: the primary beam is nowhere in the image above this "
+                             "value: should be less, or the image closer to the pointing centre")
         return support
     if not grid.mask:
         return None
@@ -72,7 +72,7 @@ def _mask_of(entry, plane):
             deconvolver.initminorcycle()
             deconvolver.setupmask()
         except (RuntimeError, UnicodeDecodeError) as error:
-            raise ValueError(f"mask = '{entry}': CASA makes no mask of this: "
+            raise ValueError(f"mask = '{entry}': CASA cannot make a mask of this: "
                              f"{' '.join(str(error).split())}") from error
         finally:
             deconvolver.done()
@@ -102,7 +102,7 @@ def _as_tclean_reads(entry, copy):
 
 
 def _write_what_tclean_needs(root, plane):
-    """Write the images that stand beside a mask: all empty, but for the primary beam and a point spread function."""
+    """Write the images that CASA needs with a mask: all empty, except the primary beam and a point spread function."""
     nx, ny = plane.shape
     x, y = np.arange(nx)[:, None] - nx // 2, np.arange(ny)[None, :] - ny // 2
     images = {".psf": np.exp(-(x**2 + y**2) / 8.0).astype(np.float32), ".pb": plane.pb}

@@ -28,7 +28,7 @@ def opened(tool_name, *args, **options):
 
 
 def made(path, parameter):
-    """Return the path of what CASA was asked to make; where it failed it may have said so in its log only.
+    """Return the path of an image that CASA was to make; it may have reported a failure in its log only.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def made(path, parameter):
     ValueError
     """
     if not os.path.exists(path):
-        raise ValueError(f"{parameter}: CASA makes no {os.path.splitext(path)[1]} image of it; the reason stands in its log")
+        raise ValueError(f"{parameter}: CASA cannot make the {os.path.splitext(path)[1]} image; the reason is in the CASA log")
     return path
 
 
@@ -92,8 +92,8 @@ def check_handles(name, names):
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and _open_handles() + _files(name) + _HANDLES > soft:
         raise OSError(errno.EMFILE, f"vis has {len(names)} MeasurementSets, and CASA opens all of them at once for the "
-                      f"coordinates of the image: there are no handles left for '{name}', of the {soft} files that this "
-                      "process may open; raise that (ulimit -n), or join MeasurementSets with concat")
+                      f"coordinates of the image: this process may open {soft} files, which is too few for "
+                      f"'{name}'; raise the limit (ulimit -n), or join MeasurementSets with concat")
 
 
 def _files(name):

@@ -1,4 +1,4 @@
-"""The brightness units of images in all spellings, by astropy and a table of what astropy does not know."""
+"""The brightness units of images in all spellings, with astropy and a table of further spellings."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def brightness_unit(text):
 
 
 def _word(match):
-    """Return a word of a unit as astropy spells it; a prefix in capitals could be mega or milli, and stays as it is."""
+    """Return a name in a unit as astropy spells it; a prefix in capitals could be mega or milli, and is kept."""
     word = match[0]
     if word.lower() in _WORDS:
         return _WORDS[word.lower()]

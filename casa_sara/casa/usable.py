@@ -1,4 +1,4 @@
-"""Which samples of a MeasurementSet can be used, and for what reason the others cannot.
+"""Which samples of a MeasurementSet are usable, and the reasons why the others are not.
 
 Most is seen of a sample by itself, while it is read. What is out of proportion to the others is told when all have been
 read, from what does not depend on their order: it is the same in whatever pieces they are read, and however they are
@@ -14,7 +14,7 @@ from casa_sara.parallel import SERIAL
 
 __all__ = ["IN_FLAGS", "SMALLEST", "Usability"]
 
-IN_FLAGS = ("autocorrelation", "flagged row", "flagged")  # what the MeasurementSet itself says of a sample
+IN_FLAGS = ("autocorrelation", "flagged row", "flagged")  # reasons that the flags of the MeasurementSet give
 SMALLEST, LARGEST = 1e-18, 1e18  # of √w·|V|: its square is a number in single precision
 LIGHTEST, HEAVIEST = 1e-30, 1e30  # of the weights, in 1/Jy²
 SUREST = 1e9  # √w·|V| beyond what any receiver measures
@@ -54,7 +54,7 @@ class Usability:
         -------
         ok : bool (R, C)
         weighted : list of bool (R, C)
-            For each hand, where it has a weight.
+            For each correlation, where it has a weight.
         """
         ok = np.ones(chunk.flag.shape, dtype=bool)
         weighted = _weighted(chunk)
@@ -135,7 +135,7 @@ def _is_impossible(uvw_m):
 
 
 def _weighted(chunk):
-    """Return where each hand has a weight, a list of bool (R, C)."""
+    """Return where each correlation has a weight, a list of bool (R, C)."""
     least = LIGHTEST
     if chunk.either:
         least = np.maximum(np.fmax(*chunk.weight) / ABOVE_OTHERS, LIGHTEST)
@@ -143,7 +143,7 @@ def _weighted(chunk):
 
 
 def _range_of_weights(weight, data, comm):
-    """Return the weight above which samples have a say in what is usual, and the one above which they are impossible."""
+    """Return the weight above which samples count for the statistics, and the one above which they are impossible."""
     lowest = 0.0
     for middle, share in zip(*gaps(weight, ABOVE_OTHERS, comm)):
         if share <= FEW or share < MINORITY and _share_an_antenna(data, weight > middle, comm):

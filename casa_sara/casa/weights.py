@@ -39,8 +39,8 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     The uv cells are square, of side 1/(field of view) of the larger image side. imager reads
     the selection again, without autocorrelations and flagged rows; the MeasurementSets are
     opened read-only and nothing is written to them. Where samples were left out that no flag
-    told it of, where one hand has no weight, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM, and where its
-    grid cannot be right, because it holds less than the sample itself, the samples are counted here.
+    told it of, where one correlation has no weight, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM, and
+    where its grid cannot be right, because it holds less than the sample itself, the samples are counted here.
 
     Parameters
     ----------
@@ -130,7 +130,7 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
 
 
 def sum_of_weights(visibilities, weights, stokes="I"):
-    """tclean's `.sumwt`: each sample of Stokes I counts once for each parallel hand that it is the mean of."""
+    """tclean's `.sumwt`: each sample of Stokes I counts once for each parallel-hand correlation that it is the mean of."""
     if stokes != "I":
         return float(weights.sum(dtype=float))
     return float(np.dot(weights, visibilities.rows.hands[visibilities.row].astype(float)))
@@ -196,7 +196,7 @@ def _field_uv(visibilities, frame):
 
 
 def _channel_wave_numbers(visibilities):
-    """Return wavelengths per metre (M,) at the channel frequencies as they stand in the data."""
+    """Return wavelengths per metre (M,) at the channel frequencies as they are in the data."""
     rows, wave_numbers = visibilities.rows, np.empty(visibilities.size)
     for ms, spws in visibilities.spws.items():
         with opened("msmetadata", readable(visibilities.ms_names[ms])) as md:

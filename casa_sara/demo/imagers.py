@@ -1,4 +1,4 @@
-"""Runs tsara and tclean on the same data and reads what they made."""
+"""Runs tsara and tclean on the same data and reads their images."""
 
 from __future__ import annotations
 

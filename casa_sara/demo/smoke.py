@@ -1,4 +1,4 @@
-"""A few seconds of everything: simulate, image with tsara, check the products."""
+"""A smoke test of a few seconds: simulate, image with tsara, check the products."""
 
 from __future__ import annotations
 

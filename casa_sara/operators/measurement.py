@@ -193,7 +193,7 @@ def check_field(longest, shape, cell_rad):
     if width * longest < 1:
         cells = [f"{cell * ARCSEC_PER_RAD:.4g}arcsec" for cell in cell_rad]
         raise ValueError(f"imsize = {list(shape)} with cell = {cells} is an image {width * ARCSEC_PER_RAD:.3g} arcsec "
-                         f"wide: should hold the finest fringe at least, {ARCSEC_PER_RAD / longest:.3g} arcsec")
+                         f"wide: should be at least as wide as the finest fringe, {ARCSEC_PER_RAD / longest:.3g} arcsec")
 
 
 def _decimations(shape, reach, eps, dtype):

@@ -1,4 +1,4 @@
-"""The measurement operator that a sky and an image ask for: plain, with the w-term, with a spectrum.
+"""The measurement operator of an image: two-dimensional, with the w-term, or with a known spectrum.
 
 Where the brightness follows a power law of the frequency with a known index,
 

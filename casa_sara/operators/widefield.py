@@ -54,8 +54,8 @@ class WTerm:
     @property
     def words(self) -> str:
         """The same for the log."""
-        way = f"a series of {self.terms} transforms" if self.terms else "the w-gridder of ducc0"
-        return f"w-term: turns phases by up to {self.phase:.3g} rad in this image, modelled by {way}"
+        way = f"a series of {self.terms} Fourier transforms" if self.terms else "the w-gridder of ducc0"
+        return f"w-term: changes phases by up to {self.phase:.3g} rad in this image, modelled by {way}"
 
 
 def w_operator(uvw, cell_rad, shape, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1):

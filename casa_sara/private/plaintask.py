@@ -1,4 +1,4 @@
-"""What every task does around its implementation, as the tasks of casatasks do it."""
+"""The common part of all tasks: checks, log messages and errors, as in casatasks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a task needs in the CASA shell: inp, default, tget, tput, go and a call."""
+"""The task interface of the CASA shell: inp, default, tget, tput, go and a call."""
 
 from __future__ import annotations
 

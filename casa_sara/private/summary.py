@@ -1,4 +1,4 @@
-"""The dictionary that tsara returns: tclean's, and what SARA knows besides."""
+"""The dictionary that tsara returns: that of tclean, and a record of SARA."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ __all__ = ["cube_summary", "summary"]
 
 WHY = {
     "threshold_jy_per_pixel": "kappa of the last iteration: starts at 0.15 of the mean brightness of the NNLS image, "
-    "shrinks with every re-weighting, is halved where the residual rises; sets the pace only",
-    "noise_jy_per_beam": "of the naturally weighted dirty image, from the weights and the noise levels found",
+    "decreases with every re-weighting, and is halved where the residual rises; affects the speed of convergence only",
+    "noise_jy_per_beam": "of the naturally weighted dirty image, computed from the MS weights and the noise found",
     "data_norm_sq": "largest eigenvalue of the preconditioned normal operator, by Lanczos iterations",
-    "regscale": "as given; 1 weighs the prior at the noise of one coefficient of the gradient of the data",
+    "regscale": "the task parameter; with 1, the weight of the prior is the noise of one coefficient of the gradient of the "
+    "data term",
 }
 PAPER_WHY = {
-    "threshold_jy_per_pixel": "kappa: 1e-5 of the brightest pixel of the first image, and constant",
-    "regscale": "without meaning in this method",
+    "threshold_jy_per_pixel": "kappa: constant, 1e-5 of the brightest pixel of the first image",
+    "regscale": "not used by this method",
 }
 
 
@@ -100,7 +101,7 @@ def _outcome(options, ends, code, minor, sara):
 
 
 def _stop_code(channel, cube):
-    """Return the stop code of a channel: of one that was not solved, what stopped the run before it."""
+    """Return the stop code of a channel: for one that was not solved, the code of the run."""
     solved = channel.result and channel.result.reconstruction
     return solved.record.stop_code if solved else cube.stopped or ITERATION_LIMIT
 
@@ -150,7 +151,7 @@ def _sara(result, options, full):
 
 
 def _solution(result, options, full):
-    """Return what is known of a solution, nothing where there is none."""
+    """Return the entries about a solution, none where there is none."""
     solved, sara = result.reconstruction, {}
     if solved:
         record = solved.record

@@ -1,4 +1,4 @@
-"""The task saracompare: what the user asked for, checked and handed to the comparison."""
+"""The task saracompare: checks its parameters and runs the comparison."""
 
 from __future__ import annotations
 

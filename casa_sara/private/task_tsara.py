@@ -1,4 +1,4 @@
-"""The task tsara: what the user asked for, checked and handed to the imaging."""
+"""The task tsara: checks its parameters and runs the imaging."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     log.info(f"casa_sara {casa_sara.__version__}")
     _check_stokes(parameters)
     if parameters["method"] == "dabbech2018":
-        log.info("method = 'dabbech2018': Algorithms 1 and 2 of Dabbech et al. (2018), to the letter")
+        log.info("method = 'dabbech2018': Algorithms 1 and 2 exactly as in Dabbech et al. (2018)")
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
@@ -56,8 +56,8 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     _refuse_for_cubes(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"] and comm.size > 1:
-        raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank stands in "
-                         "the first lines of the log of the run itself, docs/parallel.md tells the time")
+        raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is in "
+                         "the first lines of the log of a normal run, and docs/parallel.md explains its time")
     if parameters["dryrun"]:
         return {"forecast": rehearse(selection, grid, options, _blocks(parameters), limits)}
     make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
@@ -85,16 +85,16 @@ def _prepare(parameters, selection, grid, stack):
 
 
 def _warn_of_incomplete(vis, output):
-    """Point out model columns that a killed run left half written, unless this run writes them."""
+    """Warn of model columns that a killed run left incomplete, unless this run writes them."""
     if output.savemodel == "modelcolumn":
         return
     for name in incomplete_columns(vis):
-        log.warn(f"MODEL_DATA of '{name}' is incomplete, a run was killed while it wrote it: calibrate with it only "
-                 "after tsara with restart=True, niter=0, savemodel='modelcolumn' has written it anew")
+        log.warn(f"MODEL_DATA of '{name}' is incomplete, because a run was killed while it wrote it. Do not calibrate with "
+                 "it before tsara with restart=True, niter=0, savemodel='modelcolumn' has written it again")
 
 
 def _report(imagename, selection, nthreads):
-    """Write the report of one run beside its images."""
+    """Write the report of one run."""
     from casa_sara.analysis.report import write_report
     from casa_sara.compare import compare_images
 
@@ -115,10 +115,10 @@ def selection_of(parameters: dict[str, Any]) -> Selection:
 def _grid(parameters):
     planes = parameters["wprojplanes"]
     if planes in (0, 1):
-        raise ValueError(f"wprojplanes = {planes}: would leave the w-term out, which gridder = 'standard' does; should be "
+        raise ValueError(f"wprojplanes = {planes} would leave the w-term out, as gridder = 'standard' does; should be "
                          "-1, or 2 or more")
     if planes > 1:
-        log.info(f"wprojplanes = {planes}: the w-term is exact to the tolerance, and needs no planes")
+        log.info(f"wprojplanes = {planes}: not used, the w-term is computed exactly, without planes")
     shape = _pair(parameters["imsize"], "imsize", "one number of pixels, or two")
     cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
@@ -148,46 +148,47 @@ def _spectral(parameters):
 
 
 def _refuse_for_cubes(parameters):
-    """Raise for what is made of one plane only."""
+    """Raise on parameters that are for continuum images only."""
     if parameters["specmode"] != "cube":
         return
     if parameters["savemodel"] != "none":
-        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': the model column is written "
+        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': MODEL_DATA is written "
                          "from continuum images only; should be 'none'")
     if parameters["parallel"]:
-        raise ValueError("parallel = True with specmode = 'cube': several processes share one continuum image; should be "
-                         "False, with channels shared among runs by start and nchan")
+        raise ValueError("parallel = True with specmode = 'cube': only continuum images can be shared by several "
+                         "processes; should be False. Channels can be divided among several runs with start and nchan")
     if parameters["stokes"] != "I":
-        raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes are of Stokes I; should be 'I'")
+        raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes can only be made in "
+                         "Stokes I; should be 'I'")
     if parameters["usemask"] == "pb" or parameters["mask"]:
         raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': masks "
-                         "are of continuum images only; should be usemask = 'user', mask = ''")
+                         "can only be used for continuum images; should be usemask = 'user', mask = ''")
     if parameters["npixels"]:
-        raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': the uv cell of a channel is that "
-                         "of the image; should be 0")
+        raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
+                         "image only; should be 0")
     if parameters["report"]:
-        raise ValueError("report = True with specmode = 'cube': the report is of one image; should be False")
+        raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be False")
 
 
 def _check_stokes(parameters):
-    """Raise on what does not go with Stokes Q, U and V."""
+    """Raise on parameters that are not possible with Stokes Q, U and V."""
     stokes = parameters["stokes"]
     if stokes == "I":
         return
-    for name, right, reason in (("positivity", False, "it may be negative"),
-                                ("savemodel", "none", "the model column holds what both parallel hands see of Stokes I"),
-                                ("report", False, "a report is of Stokes I")):
+    for name, right, reason in (("positivity", False, "the image may be negative"),
+                                ("savemodel", "none", "MODEL_DATA is written for Stokes I only"),
+                                ("report", False, "reports are made for Stokes I only")):
         if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} does not go with stokes = '{stokes}', {reason}: set {name} = "
+            raise ValueError(f"{name} = {parameters[name]!r} is not possible with stokes = '{stokes}', {reason}: set {name} = "
                              f"{right!r}")
 
 
 def _check_method(parameters):
-    """Raise on what the algorithm of the paper does not know."""
+    """Raise on parameters that the algorithm of the paper does not have."""
     method = parameters["method"]
     if method == "tsara":
         return
-    for name, right, reason in (("regscale", 1.0, "it has no noise that could weigh its prior"),
+    for name, right, reason in (("regscale", 1.0, "its prior has no weight that depends on the noise"),
                                 ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
                                 ("parallel", False, "it runs in one process")):
         if parameters[name] != right:
@@ -251,9 +252,9 @@ def _seconds(maxtime):
 def _solver_options(parameters, comm):
     if parameters["databound"] == "fixed" and not parameters["l2bound"]:
         raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
-                         "blocks or one for each, in units of what the weights say")
+                         "blocks or one for each, relative to the MS weights")
     if not parameters["regscale"] > 0:
-        raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the noise")
+        raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the automatic weight of the prior")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}
     values = {name: tuple(value) if isinstance(value := parameters[name], list) else value for name in names}
     nthreads = min(parameters["nthreads"] or _own_cores(comm), os.cpu_count() or 1)
@@ -277,8 +278,8 @@ def _output(parameters):
         if not unfinished:
             startmodel = _model_to_continue(imagename, startmodel, old)
     elif unfinished and not parameters["overwrite"]:
-        raise FileExistsError(f"imagename = '{imagename}': a run that has not finished left '{checkpoint}'; choose "
-                              "another name, restart = True to go on from it, or overwrite = True to begin anew")
+        raise FileExistsError(f"imagename = '{imagename}': an unfinished run left '{checkpoint}'; choose "
+                              "another name, restart = True to continue from it, or overwrite = True to start anew")
     elif old and not parameters["overwrite"]:
         raise FileExistsError(f"imagename = '{imagename}': {', '.join(old)} exist; choose another name, "
                               "overwrite = True to replace them, or restart = True to continue from the model")
@@ -296,6 +297,6 @@ def _model_to_continue(imagename, startmodel, old):
                  "starting from the beginning")
         return startmodel
     if startmodel:
-        raise ValueError(f"startmodel = '{startmodel}' and restart = True both give the first model: set only one")
+        raise ValueError(f"startmodel = '{startmodel}' and restart = True both define the first model: set only one of them")
     log.info(f"restart = True: continuing from '{model}'")
     return model

@@ -50,7 +50,7 @@ class Parameter(NamedTuple):
         return value in self.open_on if self.open_on else value not in self.open_unless
 
     def expected(self) -> str:
-        """Return what values are right, in words."""
+        """Return a description of the valid values."""
         words = " or ".join(TYPE_WORDS[name] for name in self.types)
         if self.allowed:
             choice = ", ".join(map(repr, self.allowed))

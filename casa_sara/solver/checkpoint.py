@@ -1,4 +1,4 @@
-"""The checkpoint of a run: what it belongs to, when it is written, and what is read from it."""
+"""The checkpoint of a run: the data and parameters to which it belongs, its writing and reading."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Checkpoint:
             raise self.refusal(error) from None
 
     def identify(self, **data):
-        """Say what the data are, by arrays, their digests or None, and hold that against what was read.
+        """Identify the data, by arrays, their digests or None, and compare them with those of the file that was read.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class Checkpoint:
 
     @contextmanager
     def applied(self, read=True):
-        """Yield `state`, to be put to use: what does not fit is a reason to refuse it; afterwards it is let go.
+        """Yield `state` to be restored; an error meanwhile means that it does not fit. Afterwards it is released.
 
         With `read` = False it was another rank that has read it, and says so.
         """
@@ -95,7 +95,7 @@ class Checkpoint:
         if not read:
             return
         age = time.time() - self._found["written"]
-        self.tell(f"resuming from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
+        self.tell(f"continuing from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
         self.state = None
 
     def due(self, now=False):
@@ -136,6 +136,7 @@ class Checkpoint:
         raise CheckpointError(f"it is of another {name} of casa_sara: {found}, and this is {wanted}")
 
     def refusal(self, reason):
-        """Return the error that says why the file cannot be resumed from."""
-        return CheckpointError(f"restart = True: '{self.path}' cannot be resumed: {reason}. Run as it was begun, or "
-                               "set restart = False and overwrite = True to begin anew, or choose another imagename")
+        """Return the error why the run cannot be continued from the file."""
+        return CheckpointError(f"restart = True: '{self.path}' cannot be continued: {reason}. Use the same data and "
+                               "parameters, or set restart = False and overwrite = True to start anew, or choose "
+                               "another imagename")

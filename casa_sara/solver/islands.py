@@ -1,4 +1,4 @@
-"""What the model consists of, island by island, and what it has left in the residual."""
+"""The islands of emission of the model, and the significance of the residual."""
 
 from __future__ import annotations
 

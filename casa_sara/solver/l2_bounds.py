@@ -34,7 +34,7 @@ def chi_square_bounds(samples, noise=1.0):
 class _NoiseLevels:
     """What given and adaptive bounds share: noise levels, and the multipliers that belong to them.
 
-    A bound is a noise level, ε_j = σ_j √(2M_j), σ_j in units of what the weights say, thermal noise and
+    A bound is a noise level, ε_j = σ_j √(2M_j), σ_j relative to the MS weights, thermal noise and
     calibration errors together.  The level fixes the Lagrange multiplier of the block's ellipsoid: the image
     that minimises
 
@@ -65,7 +65,7 @@ class _NoiseLevels:
 
     @property
     def noise(self):
-        """σ_j: noise level in units of what the weights say, (d,)."""
+        """σ_j: noise level relative to the MS weights, (d,)."""
         return self.l2_bounds / np.sqrt(2.0 * self.samples)
 
     @property

@@ -1,4 +1,4 @@
-"""Where positive pixels contradict the data: unresolved sources between pixels.
+"""Unresolved sources between pixels, which non-negative pixels cannot represent.
 
 A source between pixels has, on the grid, the shape of a shifted sinc within the band of the data, with negative
 lobes.  Positive pixels cannot hold it, and what they cannot hold stays in the residual, an error of tens of per cent of

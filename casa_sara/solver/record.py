@@ -1,4 +1,4 @@
-"""What happened during a solution, kept for the log, the return dictionary and the plots."""
+"""The history of a solution, for the log, the return dictionary and the plots."""
 
 from __future__ import annotations
 

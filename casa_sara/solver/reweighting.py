@@ -76,7 +76,7 @@ class Schedule:
 
 @dataclass
 class Stage:
-    """Where Algorithm 2 stands, beside the iteration and its bounds.
+    """The state of Algorithm 2, in addition to those of the iteration and its bounds.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where the model may be other than zero: where the data show emission at the significance asked for.
+"""The support of the model: the pixels where the data show emission at the requested significance.
 
 Noise is fitted by positive pixels as a carpet of islands of one or two standard deviations, and no penalty that leaves
 faint sources alone removes it.  The model is therefore confined to a support, found anew at every re-weighting: pixels

@@ -1,4 +1,4 @@
-"""The state of an unfinished solution in a file: written whole or not at all, believed only when every bit is right.
+"""The state of an unfinished solution in a file, which is replaced atomically and verified by checksums.
 
 The file is
 
@@ -26,7 +26,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 class CheckpointError(ValueError):
-    """The checkpoint is not one that this run can go on from; the message says why."""
+    """This run cannot be continued from the checkpoint; the message says why."""
 
 
 def fill(array, values):

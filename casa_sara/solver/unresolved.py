@@ -1,4 +1,4 @@
-"""Sources that one point explains: what the data cannot tell from a point is modelled as one.
+"""Sources that are consistent with a point, and are modelled as one.
 
 The prior prefers smooth sources, and where a source is faint the data do not contradict it: an unresolved source comes
 out as wide as the beam, and too faint where it is.  Of a source that leaves nothing significant when one point is taken

@@ -5,9 +5,9 @@ from casa_sara.private.validation import Parameter
 
 PARAMETERS = (
     Parameter('models', ('string', 'stringVec'), '', 'Names of the products to compare, two or more', required=True),
-    Parameter('names', ('string', 'stringVec'), [], 'What to call the products; []: by their file names'),
+    Parameter('names', ('string', 'stringVec'), [], 'Names of the products in the report; []: their file names'),
     Parameter('outdir', ('string',), '', "Folder for the report; '': none"),
-    Parameter('vis', ('path', 'pathVec'), [], "Name of visibility file(s) that all models are held against; '': none", mustexist=True),
+    Parameter('vis', ('path', 'pathVec'), [], "Name of visibility file(s) to compare all models with; '': none", mustexist=True),
     Parameter('selectdata', ('bool',), True, 'Enable data selection parameters'),
     Parameter('field', ('string', 'stringVec'), '', 'Field(s) to select', opener='selectdata', open_on=(True,)),
     Parameter('spw', ('string', 'stringVec'), '', 'Spectral window(s) and channels to select', opener='selectdata', open_on=(True,)),
@@ -25,35 +25,35 @@ PARAMETERS = (
     Parameter('threshold', ('double',), 0.001, 'The support is what exceeds this fraction of the peak', minimum=0.0, maximum=1.0),
     Parameter('inject', ('string', 'stringVec'), [], 'Where to inject point sources, to measure the resolution; []: nowhere'),
     Parameter('injectflux', ('double',), 0.0, 'Flux of each injected source in Jy; 0: 100 times the noise per beam', minimum=0.0),
-    Parameter('frames', ('string', 'stringVec'), [], 'Images to show one after the other, as an animation in the report'),
+    Parameter('frames', ('string', 'stringVec'), [], 'Images of an animation in the report, in the order to show them'),
     Parameter('overwrite', ('bool',), False, 'Write into a folder that holds files'),
 )
 
 
 class _saracompare:
-    """Compare images of one sky, tsara's, tclean's or others', by the same measures.
+    """Compare images of the same sky made by tsara, tclean or other imagers, with the same measures.
 
-    saracompare takes the models that several imagers made of one sky and says how they compare:
-    dynamic range, similarity, flux in regions, what is left in the residuals and, where a truth is
-    known, the error against it. The definitions are those of Dabbech et al. (2018).
+    saracompare compares the models that several imagers made of the same sky: dynamic range,
+    similarity, flux in regions, statistics of the residuals and, where the true sky is known, the
+    error of each model. The definitions are those of Dabbech et al. (2018).
 
-    With vis the comparison is fair: the residual image of every model is made of the same
-    visibilities, by one operator and with the same weights, natural and Briggs. The restored image
-    is the model convolved with the beam of these weights, plus that residual. Without vis the
-    residual images beside the models are used as they are.
+    With vis all models are treated alike: the residual image of every model is made from the same
+    visibilities, with the same measurement operator and the same weights, natural and Briggs. The
+    restored image is the model convolved with the beam of these weights, plus that residual. Without
+    vis the residual images beside the models are used as they are.
 
-    All is measured on the pixels of the first model. Models on other pixels are brought there with
-    their flux kept; their residuals are made from their own pixels, where these have the centre of
-    the first. Images that cannot be compared are refused.
+    Everything is measured on the pixel grid of the first model. Models on other grids are regridded
+    to it with their flux conserved; their residuals are made on their own grid, where it has the same
+    centre. Images that cannot be compared are refused.
 
     Parameters
     ----------
     models : str or list of str, required
-        Each is the common root of an imager's products, a model image, or a FITS file (.fits.gz
-        too), in Jy/pixel or a unit that can be converted to it, as mJy/pixel or MJy/sr. Beside
-        root.model or root.model.fits, the residual, image, PSF and the record of tsara
-        (root.sara.json) are found by their names. The first sets the pixels: of one whose axes are
-        mirrored or turned, pixels of this size with right ascension to the left and north up.
+        Each is the common root of an imager's products, a model image, or a FITS file (.fits.gz too),
+        in Jy/pixel or a unit that can be converted to it, as mJy/pixel or MJy/sr. Beside root.model
+        or root.model.fits, the residual, image, PSF and the record of tsara (root.sara.json) are
+        found by their names. The first defines the pixel grid; if its axes are mirrored or rotated,
+        the grid has its cell size, with east to the left and north up.
         Examples: models=['run/sara', 'run/clean']
                   models=['sara.model', 'other.fits']
 
@@ -72,9 +72,9 @@ class _saracompare:
                   vis=['cyga_A.ms', 'cyga_B.ms']
 
     selectdata : bool, default True
-        True opens, where vis is given, the selection parameters field, spw, timerange, uvrange, antenna, scan,
-        observation and intent. All take the MSSelection syntax of tclean, either as one string for
-        all MeasurementSets or as a list with one string for each.
+        True opens, where vis is given, the selection parameters field, spw, timerange, uvrange,
+        antenna, scan, observation and intent. All take the MSSelection syntax of tclean, either as
+        one string for all MeasurementSets or as a list with one string for each.
 
     field : str or list of str, default ''
         Opened by selectdata = True.
@@ -135,7 +135,7 @@ class _saracompare:
         The residuals are made with natural weights and with Briggs weights of this parameter.
 
     truth : str, default ''
-        A CASA image or FITS file in Jy/pixel, brought to the pixels of the first model. It adds
+        A CASA image or FITS file in Jy/pixel, regridded to the first model. It adds
         signal-to-noise ratios, the structural similarity and the error at several scales.
 
     regions : str or list of str, default []
@@ -153,13 +153,12 @@ class _saracompare:
         smoothed to the beam: one support for all.
 
     inject : str or list of str, default []
-        Right ascension and declination of one or more point sources. They are put into the
-        visibilities (never into the MeasurementSet), and every image of tsara is made anew, without
-        and with them and with the parameters in its history, which takes twice the time of its run.
-        The difference tells how much of the flux is recovered, where, and how wide: the resolution
-        actually reached. Needs vis. Best on empty sky, two beams or more from each other and from
-        other emission. Other imagers are not run again; their restored images have the width of the
-        beam.
+        Right ascension and declination of one or more point sources. They are added to the
+        visibilities (in memory, never in the MeasurementSet), and every image of tsara is made again
+        without and with them, with the parameters in its history, which takes twice the time of its
+        run. The difference shows how much of the flux is recovered, at which position, and how wide:
+        the resolution that is reached. Needs vis. Choose positions without emission, at least two
+        beams from each other and from other sources. Images of other imagers are not made again.
         Example: inject=['19h59m28.3s +40d44m12s']
 
     injectflux : float, default 0.0
@@ -168,12 +167,12 @@ class _saracompare:
     frames : str or list of str, default []
         Two or more images of the field with different pixel sizes, in the order to show them, named
         as in models and with their centre. The animation shows the field and every region of
-        regions, all frames on one scale of brightness.
+        regions, all with the same brightness scale.
         Example: frames=['cell0.2/sara', 'cell0.1/sara', 'cell0.05/sara']
 
     overwrite : bool, default False
-        True replaces the files of an earlier report in outdir, which report.files names, all
-        together when the new ones are complete; other files stay. False refuses to start when
+        True replaces the files of an earlier report in outdir (those listed in report.files), all
+        together when the new ones are complete; other files are kept. False refuses to start when
         outdir holds any.
 
     Returns
@@ -206,7 +205,7 @@ class _saracompare:
     """
 
     _info_group_ = 'imaging'
-    _info_desc_ = "Compare images of one sky, tsara's, tclean's or others', by the same measures"
+    _info_desc_ = 'Compare images of the same sky made by tsara, tclean or other imagers, with the same measures'
 
     def __call__(
         self, models='', names=[], outdir='', vis=[], selectdata=True, field='', spw='', timerange='', uvrange='',

@@ -34,7 +34,7 @@ PARAMETERS = (
     Parameter('interpolation', ('string',), 'nearest', 'Spectral interpolation (nearest)', allowed=('nearest',), opener='specmode', open_on=('cube',)),
     Parameter('perchanweightdensity', ('bool',), True, 'Whether to calculate the weight density per channel', allowed=(True,), opener='specmode', open_on=('cube',)),
     Parameter('gridder', ('string',), 'standard', 'Gridding options (standard, wproject)', allowed=('standard', 'wproject')),
-    Parameter('wprojplanes', ('int',), -1, 'For scripts of tclean; the w-term needs no planes here', minimum=-1.0, opener='gridder', open_on=('wproject',)),
+    Parameter('wprojplanes', ('int',), -1, 'Accepted for compatibility with tclean; the w-term needs no planes here', minimum=-1.0, opener='gridder', open_on=('wproject',)),
     Parameter('pblimit', ('double',), 0.2, 'PB gain level at which to cut off normalizations', minimum=-1.0, maximum=1.0),
     Parameter('weighting', ('string',), 'natural', 'Weighting scheme of the psf, residual and restored images (natural, uniform, briggs)', allowed=('natural', 'uniform', 'briggs')),
     Parameter('robust', ('double',), 0.5, 'Robustness parameter', minimum=-2.0, maximum=2.0, opener='weighting', open_on=('briggs',)),
@@ -43,36 +43,36 @@ PARAMETERS = (
     Parameter('restoration', ('bool',), True, 'Do restoration steps (or not)'),
     Parameter('restoringbeam', ('string', 'stringVec'), [], 'Restoring beam shape to use. Default is the PSF main lobe', opener='restoration', open_on=(True,)),
     Parameter('pbcor', ('bool',), False, 'Apply PB correction on the output restored image', opener='restoration', open_on=(True,)),
-    Parameter('method', ('string',), 'tsara', "Algorithm: that of this task, or the paper's to the letter", allowed=('tsara', 'dabbech2018')),
+    Parameter('method', ('string',), 'tsara', 'Algorithm: that of this task, or exactly that of the paper', allowed=('tsara', 'dabbech2018')),
     Parameter('niter', ('int',), 100000, 'Maximum number of iterations; 0 makes dirty images only', minimum=0.0),
-    Parameter('wavelets', ('stringVec',), ['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], 'Bases in which the sky is sparse together', allowed=('dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8')),
+    Parameter('wavelets', ('stringVec',), ['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], 'Bases of the sparsity dictionary', allowed=('dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8')),
     Parameter('wavelevels', ('int',), 4, 'Levels of the wavelet transforms', minimum=1.0),
     Parameter('usemask', ('string',), 'user', 'Type of mask(s) for deconvolution: user, or pb', allowed=('user', 'pb')),
     Parameter('mask', ('string', 'stringVec'), '', 'Mask (a list of image name(s) or region file(s) or region string(s) )', opener='usemask', open_on=('user',)),
     Parameter('pbmask', ('double',), 0.0, 'primary beam mask', minimum=0.0, maximum=1.0, opener='usemask', open_on=('user', 'pb')),
-    Parameter('positivity', ('bool',), True, 'Keep the model from becoming negative'),
-    Parameter('precondition', ('bool',), True, 'Use the sampling density to converge faster'),
+    Parameter('positivity', ('bool',), True, 'Require a non-negative model'),
+    Parameter('precondition', ('bool',), True, 'Use the density of the uv coverage to converge faster'),
     Parameter('databound', ('string',), 'adapt', 'How closely the model must fit each block of data', allowed=('adapt', 'weights', 'fixed')),
     Parameter('boundtol', ('double',), 0.01, 'Relative difference of residual and bound that counts as met', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('boundrelchange', ('double',), 0.01, 'Relative change of the model below which bounds may move', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('boundstep', ('double',), 0.618, 'Fraction of the way to the residual that a bound moves', minimum=0.0, maximum=1.0, opener='databound', open_on=('adapt',)),
     Parameter('boundinterval', ('int',), 20, 'Fewest iterations between two moves of a bound', minimum=1.0, opener='databound', open_on=('adapt',)),
-    Parameter('l2bound', ('doubleVec',), [], 'Noise level of each block, as a multiple of what the weights say', minimum=1e-06, maximum=1000000.0, opener='databound', open_on=('fixed',)),
+    Parameter('l2bound', ('doubleVec',), [], 'Noise level of each block, relative to the MS weights', minimum=1e-06, maximum=1000000.0, opener='databound', open_on=('fixed',)),
     Parameter('nreweights', ('int',), 20, 'Maximum number of re-weightings', minimum=0.0),
     Parameter('reweightdecay', ('double',), 0.618, 'Factor on the scale of the sparsity weights at each re-weighting', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
     Parameter('reweighttol', ('double',), 0.01, 'Relative change of the model between re-weightings that ends them', minimum=0.0, maximum=1.0, opener='nreweights', open_unless=(0,)),
     Parameter('reltol', ('double',), 0.0003, 'Relative change of the model in one iteration that counts as converged', minimum=0.0, maximum=1.0),
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
-    Parameter('significance', ('double',), 5.0, 'Signal-to-noise ratio of emission that enters the model; 0 for no limit', minimum=0.0),
-    Parameter('blocks', ('int', 'string', 'stringVec'), 0, 'Data blocks, each with its own bound: 0, one per snapshot; a number; or which data to set apart'),
+    Parameter('significance', ('double',), 5.0, 'Signal-to-noise ratio above which emission enters the model; 0 for no limit', minimum=0.0),
+    Parameter('blocks', ('int', 'string', 'stringVec'), 0, 'Data blocks, each with its own noise level: 0 for one per snapshot, a number, or selections of data'),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0, maximum=1024.0),
-    Parameter('dryrun', ('bool',), False, 'Only say what the run would take: memory and time'),
+    Parameter('dryrun', ('bool',), False, 'Only predict the memory and time of the run'),
     Parameter('maxmem', ('double',), 0.0, 'Most memory to use, in GB; 0: what the machine has available', minimum=0.0),
     Parameter('maxtime', ('string', 'int', 'double'), '', "Longest time to take, as '2h', or in minutes; '': no limit"),
     Parameter('fullsummary', ('bool',), False, 'Return dictionary with complete convergence history'),
     Parameter('report', ('bool',), False, 'Write a report of the run, imagename.report/report.html'),
-    Parameter('restart', ('bool',), False, 'Go on from imagename.checkpoint, or else continue from imagename.model'),
+    Parameter('restart', ('bool',), False, 'Continue from imagename.checkpoint, or else from imagename.model'),
     Parameter('overwrite', ('bool',), False, 'Replace existing images'),
     Parameter('savemodel', ('string',), 'none', 'Options to save model visibilities (none, modelcolumn)', allowed=('none', 'modelcolumn')),
     Parameter('parallel', ('bool',), False, 'Run on the processes of an MPI job'),
@@ -80,25 +80,26 @@ PARAMETERS = (
 
 
 class _tsara:
-    """Image MeasurementSets with SARA: sparse, positive, faithful to the data within the noise.
+    """Image MeasurementSets with SARA: sparse, non-negative, consistent with the data to within the noise.
 
     tsara reconstructs images of the sky from visibilities, continuum or cubes, as tclean does, with
-    SARA instead of CLEAN. It looks for the sky that is sparsest in a set of bases together (the pixels
-    and eight Daubechies wavelets), nowhere negative, and in agreement with every block of
-    visibilities to within its noise level. The solver is the adaptive preconditioned primal-dual
-    algorithm of Dabbech et al. (2018), which also finds noise levels that the weights do not tell.
+    SARA instead of CLEAN. It finds the non-negative sky that is sparsest in a set of bases together
+    (the pixels and eight Daubechies wavelets) and that agrees with every block of visibilities to
+    within its noise. The solver is the adaptive preconditioned primal-dual algorithm of Dabbech et
+    al. (2018), which also estimates the noise of every block where the weights are not the true
+    inverse variances.
 
-    The parameters that tclean has carry its names, types and meaning, and the products are
-    tclean's: .model, .psf, .residual, .image, .sumwt and .pb. Two differences matter:
+    Parameters that tclean also has keep their names, types and meaning, and the image products are
+    those of tclean: .model, .psf, .residual, .image, .sumwt and .pb. Two differences matter:
 
     - The model image (.model, Jy/pixel) is the result. It is made of resolved structure, not of
       delta functions, and its resolution usually exceeds the beam's. The restored image (.image)
       is there to be compared with a CLEAN image.
     - Imaging weights (weighting, robust, npixels, uvtaper) act on .psf, .residual and .image only.
-      The reconstruction always weighs the data by their noise, and uses the density of the
-      samples to converge faster.
+      The reconstruction always uses the statistical weights of the data, and the density of the uv
+      coverage only to converge faster.
 
-    For most data vis, imagename, imsize and cell are all there is to set. A sub-parameter that
+    For most data only vis, imagename, imsize and cell need to be set. A sub-parameter that
     would have no effect, such as robust with weighting='natural', is refused, not ignored.
 
     Parameters
@@ -182,16 +183,16 @@ class _tsara:
           out/try.image.pbcor  the restored image divided by the primary beam
           out/try.model.pbcor  the model divided by the primary beam
         with a mask
-          out/try.mask      1 where the model may be other than zero, 0 elsewhere
+          out/try.mask      1 where the model may be non-zero, 0 elsewhere
         and always
           out/try.sara.json the record 'sara' of the returned dictionary, with every iteration
-        and, as long as the run has not finished, out/try.checkpoint, from which restart=True goes on.
-        Images that exist are left alone, and the task refuses to start, unless restart or
-        overwrite says otherwise.
+        and, until the run has finished, out/try.checkpoint, from which restart=True continues. If
+        images of that name exist, the task refuses to start and leaves them as they are, unless
+        restart or overwrite is True.
 
     imsize : int or list of int, default [100]
         Number of pixels in right ascension and declination; one number makes a square image. All
-        bright sources in the primary beam should be inside. Any number does, odd ones too;
+        bright sources in the primary beam should be inside. Any number is allowed, also an odd one;
         products of 2, 3 and 5 are fastest.
         Examples: imsize=[512, 256]
                   imsize=500
@@ -206,37 +207,39 @@ class _tsara:
                   cell=0.06
 
     phasecenter : int or str, default ''
-        The direction of the image centre, or the number of the field that has it. '' takes the
-        first selected field.
+        The direction of the image centre, or the number of the field whose direction it is. '' takes
+        the first selected field.
         Examples: phasecenter='J2000 19h59m28.356 +40d44m02.10'
                   phasecenter=2
 
     stokes : {'I', 'Q', 'U', 'V'}, default 'I'
         One of I, Q, U and V. I is formed from RR and LL, from XX and YY, or from one of the two where
-        only one was recorded; Q and U take RL and LR, V takes RR and LL; of linear feeds Q takes XX
-        and YY, U and V take XY and YX. One that is stored as such is taken as it stands; other
-        correlations beside those needed, and their order, do not matter. Q, U and V may be negative:
-        they need positivity=False. As in tclean, a sample with any correlation flagged
-        is not used; where only the weight of a parallel hand is 0, negative or NaN, I is the other one.
+        only one was recorded. With circular feeds, Q and U are formed from RL and LR, V from RR and
+        LL; with linear feeds, Q from XX and YY, U and V from XY and YX. Data that are stored as
+        Stokes parameters are used as they are; other correlations, and their order, do not matter. Q,
+        U and V may be negative and need positivity=False. As in tclean, a sample with any correlation
+        flagged is not used. Where the weight of one parallel-hand correlation is 0, negative or NaN,
+        I is taken from the other one alone.
 
     projection : {'SIN'}, default 'SIN'
-        Only SIN: the projection in which an interferometer sees the sky.
+        Only SIN, the projection that a coplanar interferometer measures.
 
     startmodel : str, default ''
-        An image to start from, CASA's or a FITS file (.fits.gz too), on any grid: it is regridded with
-        its flux kept. It is in Jy/pixel, or in a unit that can be converted to it as mJy/pixel. It
-        changes how long the solver takes, not what it converges to, where the data decide. On scales
-        that no baseline sees the solution keeps some of it, from a quarter to all in trials: it helps,
-        but does not assure the extended flux of a single dish. For that, feather .image afterwards.
+        An image to start from, CASA's or a FITS file (.fits.gz too), on any grid: it is regridded
+        with its flux kept. It is in Jy/pixel, or in a unit that can be converted to it as mJy/pixel.
+        Where the data constrain the sky it changes the time that the solver takes, not the result. On
+        scales that no baseline measures, the result keeps part of it (from a quarter to all in
+        trials), so a single-dish image helps, but does not guarantee the total flux. For that,
+        feather .image afterwards.
         Example: startmodel='first.model'
 
     specmode : {'mfs', 'cube'}, default 'mfs'
-        'mfs'   one continuum image of all selected channels. The sky is assumed to be as bright at
-                all frequencies, unless spectralindex says how it changes: a source of another
-                spectrum is averaged over the band, and across a wide band leaves errors around it
-                that no model can fit (with a spectral index of -0.8 it loses 43 % of its
-                brightness from 1 to 2 GHz). How primary beams change with frequency is not
-                modelled.
+        'mfs'   one continuum image of all selected channels. The sky is assumed to have the same
+                brightness at all frequencies, unless spectralindex gives its spectral index. A
+                source of another spectrum is averaged over the band; in a wide band this leaves
+                errors around it that no model can fit (with a spectral index of -0.8 it loses 43 %
+                of its brightness from 1 to 2 GHz). The frequency dependence of the primary beam is
+                not modelled.
         'cube'  an image of each channel, on the spectral axis that tclean makes of the same
                 parameters. The channels are solved one after the other, each from its own data,
                 with its own blocks, bounds and beam; niter and the blocks are those of a channel.
@@ -249,14 +252,14 @@ class _tsara:
 
     spectralindex : str or float, default ''
         Opened by specmode = 'mfs'.
-        The exponent a in I(f) = I(reffreq) (f/reffreq)^a, from -5 to 5, as one number for the whole sky
-        or as an image (CASA or FITS, e.g. the .alpha of tclean with nterms=2), which is interpolated
-        on the pixels; where it is masked or ends, the median of its good pixels is taken. The model,
-        and with it the restored image, is then the sky at reffreq. The index is taken as known: it is
-        not fitted. .psf and .residual are made as ever, each sample with its imaging weight. '' takes
-        the sky to be as bright at all frequencies. An image costs 3 to 10 Fourier transforms in
-        place of one, the more the wider the band and the range of the index. (tclean has no such
-        parameter.)
+        The exponent a in I(f) = I(reffreq) (f/reffreq)^a, from -5 to 5, as one number for the whole
+        sky or as an image (CASA or FITS, e.g. the .alpha of tclean with nterms=2), which is
+        interpolated on the pixels; where it is masked or ends, the median of its valid pixels is
+        used. The model, and with it the restored image, is then the sky at reffreq. The index is
+        taken as known: it is not fitted. .psf and .residual are made as in tclean, with the imaging
+        weights alone. '' assumes the same brightness at all frequencies. An image costs 3 to 10
+        Fourier transforms in place of one, the more the wider the band and the range of the index.
+        (tclean has no such parameter.)
         Examples: spectralindex=-0.7
                   spectralindex='clean.alpha'
 
@@ -285,11 +288,12 @@ class _tsara:
 
     outframe : {'LSRK', 'LSRD', 'BARY', 'GEO', 'TOPO', 'GALACTO', 'LGROUP', 'CMB'}, default 'LSRK'
         Opened by specmode = 'cube'.
-        The frame of the spectral axis; the data are followed to it in time.
+        The reference frame of the spectral axis. Data are converted to it at the time of each
+        integration.
 
     veltype : {'radio', 'optical', 'z', 'beta'}, default 'radio'
         Opened by specmode = 'cube'.
-        What a velocity in start and width means.
+        The definition of the velocities in start and width.
 
     restfreq : str or list of str, default []
         Opened by specmode = 'cube'.
@@ -299,25 +303,25 @@ class _tsara:
 
     interpolation : {'nearest'}, default 'nearest'
         Opened by specmode = 'cube'.
-        Only 'nearest': every channel of the data goes whole to the channel of the image that holds its
-        frequency. Interpolation between channels would correlate their noise, and no sample would be
-        what was measured, on which the bounds depend.
+        Only 'nearest': every data channel is assigned to the image channel that contains its
+        frequency. Interpolation would correlate the noise of neighbouring channels, while the bounds
+        assume independent noise.
 
     perchanweightdensity : {True}, default True
         Opened by specmode = 'cube'.
-        Only True: uniform and Briggs weights of a channel are those of its own samples.
+        Only True: uniform and Briggs weights of a channel are computed from its own visibilities.
 
     gridder : {'standard', 'wproject'}, default 'standard'
-        What is modelled of the way from the sky to the visibilities:
-          'standard'  a two-dimensional Fourier transform: right in a narrow field. The log says how
-                      far it is from right in the corners of the image (the largest w-term), from
-                      0.3 rad on as a warning.
-          'wproject'  the w-term of non-coplanar baselines as well. It is exact to the tolerance of the
-                      transform, which is far below the noise, for any field up to a hemisphere: by a
-                      short series of transforms where the phases are small, and by the w-gridder of the
-                      package ducc0 where they are large. The log says how large they are and which of
-                      the two is taken. The Fourier part of an iteration takes 3 to 70 times as long as
-                      with 'standard', the more the larger the phases.
+        How the visibilities of the sky are computed:
+          'standard'  a two-dimensional Fourier transform, which is accurate in a narrow field. A
+                      warning says by how much the w-term would change the phases in the corners of
+                      the image, where that is more than 0.3 rad.
+          'wproject'  the w-term of non-coplanar baselines as well. It is exact to the tolerance of
+                      the transform, which is far below the noise, for any field up to a hemisphere:
+                      by a short series of transforms where the phases are small, and by the w-gridder
+                      of the package ducc0 where they are large. The log says how large they are and
+                      which of the two is used. The Fourier transforms take 3 to 70 times as long as
+                      with 'standard', longer for larger phases.
         'wproject' applies to everything: model, .psf, .residual and the model column.
 
     wprojplanes : int, default -1
@@ -339,7 +343,7 @@ class _tsara:
           'natural'  the weights of the data
           'uniform'  the weights of the data divided by the summed weight in their uv cell
           'briggs'   a compromise between the two, set by robust
-        They never touch the model: the reconstruction weighs the data by their noise alone.
+        They have no effect on the model, which is reconstructed with the statistical weights of the data.
 
     robust : float, default 0.5
         Opened by weighting = 'briggs'.
@@ -363,95 +367,103 @@ class _tsara:
 
     restoringbeam : str or list of str, default []
         Opened by restoration = True.
-        [] fits a Gaussian to the main lobe of the psf. For another beam the residual is brought to
-        the same resolution.
+        [] fits a Gaussian to the main lobe of the psf. With another beam, the residual is convolved
+        to the same resolution.
         Examples: restoringbeam='0.3arcsec'
                   restoringbeam=['8arcsec', '10arcsec', '45deg']
 
     pbcor : bool, default False
         Opened by restoration = True.
         True makes imagename.image.pbcor, which is .image divided by .pb, and imagename.model.pbcor,
-        .model divided by .pb: brightness on the sky, where all other images show what the antennas
-        see of it. Below pblimit both are zero and masked. Where CASA has no primary beam of the
-        telescope, and its antennas no diameter, .pb is 1 everywhere, which a warning says, and these
-        images are those that were divided.
+        .model divided by .pb: the true brightness of the sky, while all other images are attenuated
+        by the primary beam. Below pblimit both are zero and masked. Where CASA knows no primary beam
+        of the telescope and no diameter of its antennas, .pb is 1 everywhere and has no effect, and a
+        warning says so.
 
     method : {'tsara', 'dabbech2018'}, default 'tsara'
         Both solve the same problem with the same operators, and make the same products:
-          'tsara'        what this task has made of the algorithm; nothing else needs to be set.
-          'dabbech2018'  Algorithms 1 and 2 as Dabbech et al. (2018) have them, for comparison: bounds that
-                         start from a non-negative least-squares fit of each block and are hard constraints,
-                         weights that fall with omega^k, 70 weighted problems. It takes many more iterations.
-        With 'dabbech2018' the parameters of the paper have the paper's values where they are left at their
-        defaults here: boundtol 1e-3, boundrelchange 1e-4, boundstep 0.618, boundinterval 100, nreweights 69,
-        reweightdecay 0.8, reweighttol 0 (never), reltol 1e-5, finalreltol 1e-6. regscale, significance and
-        parallel have no meaning in it.
+          'tsara'        the algorithm with the changes that docs/decisions.md explains; nothing else
+                         needs to be set.
+          'dabbech2018'  Algorithms 1 and 2 exactly as in Dabbech et al. (2018), for comparison:
+                         bounds that start from a non-negative least-squares fit of each block and are
+                         hard constraints, weights that fall with omega^k, 70 weighted problems. It
+                         takes many more iterations.
+        With 'dabbech2018' those parameters of the paper that are left at their defaults take the
+        values of the paper: boundtol 1e-3, boundrelchange 1e-4, boundstep 0.618, boundinterval 100,
+        nreweights 69, reweightdecay 0.8, reweighttol 0 (never), reltol 1e-5, finalreltol 1e-6.
+        regscale, significance and parallel have no meaning in it.
 
     niter : int, default 100000
-        An upper limit, so large by default that the data decide when to stop. One iteration is one
+        An upper limit, so large by default that convergence decides when to stop. One iteration is one
         step of the primal-dual algorithm on the whole image and all data; a few hundred to a few
         thousand are usual. niter=0 makes .psf, .residual (the dirty image), .sumwt and .pb, as
         tclean does.
 
     wavelets : list of str, default ['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8']
-        'dirac' is the image itself, 'db1' to 'db8' the Daubechies wavelets with that many
-        vanishing moments. The nine together are SARA's dictionary and serve compact, sharp-edged
-        and smooth emission alike. Fewer bases make an iteration cheaper.
+        'dirac' is the image itself, 'db1' to 'db8' are the Daubechies wavelets with that many
+        vanishing moments. The nine together are the dictionary of SARA, which represents compact,
+        sharp-edged and smooth emission. With fewer bases an iteration takes less time.
         Example: wavelets=['dirac', 'db1', 'db4']
 
     wavelevels : int, default 4
-        The coarsest wavelets are 2^wavelevels pixels apart.
+        Number of scales of the wavelets, each twice as large as the one before; the coarsest wavelets
+        are 2^wavelevels pixels apart.
 
     usemask : {'user', 'pb'}, default 'user'
-        Where the model may be other than zero; outside it is exactly zero.
+        Where the model may be non-zero; outside it is exactly zero.
           'user'  within mask, or everywhere without one
           'pb'    where the primary beam is above pbmask, or above pblimit if that is more
-        What the sky holds outside stays in the residual, and raises the noise levels that are found:
-        a warning says so. A mask is written as imagename.mask.
+        Emission outside the mask stays in the residual and raises the noise found; a warning says so.
+        A mask is written as imagename.mask.
 
     mask : str or list of str, default ''
         Opened by usemask = 'user'.
         A region in CASA's text format (CRTF), a file of them, or an image of ones and zeros on any
-        grid, CASA's or a FITS file; or a list of these, whose union counts. '' is no mask. An entry that selects nothing of
-        the image is refused.
+        grid, CASA's or a FITS file; or a list of these, whose union counts. '' is no mask. An entry
+        that selects nothing of the image is refused.
         Examples: mask='circle[[40pix,40pix],10pix]'
                   mask='old.mask'
                   mask=['regions.crtf', 'circle[[19h59m28.5s, 40d44m02s], 100arcsec]']
 
     pbmask : float, default 0.0
         Opened by usemask = 'user' or 'pb'.
-        The primary beam above which the mask reaches; with usemask='user' it cuts the mask off.
+        The mask contains only pixels where the primary beam is above this value; with usemask='user'
+        this limits the user's mask.
 
     positivity : bool, default True
-        True for the brightness of the sky. An unresolved source that lies between pixels cannot be held
-        by positive pixels. One that stands alone, of a signal-to-noise ratio below 300, is held by 6 x 6
-        pixels, some of them negative by at most a tenth of the source, which for the data are a point;
-        beside others the model may become negative where the data ask for it (three standard deviations,
-        twice in a row), by at most a quarter of the source; the log says how many pixels. False is for skies with negative parts, such as the
-        decrement of the Sunyaev-Zeldovich effect; the model is then less constrained.
+        True for total intensity. There is one exception: a point source between pixel centres cannot
+        be represented by positive pixels. An isolated one with a signal-to-noise ratio below 300 is
+        represented by 6 x 6 pixels, some of them negative by at most a tenth of the source. Near
+        other emission, pixels may become negative where the data require it (by three standard
+        deviations, at two re-weightings in a row), by at most a quarter of the source; the log says
+        how many. False is for skies with negative parts, such as the decrement of the
+        Sunyaev-Zeldovich effect; the model is then less constrained.
 
     precondition : bool, default True
-        True lets the density of the samples in the uv-plane scale the steps of the solver, so that
-        sparsely sampled frequencies converge along with the dense ones. It changes the number of
-        iterations, not the image they lead to.
+        True scales the steps of the solver by the density of the uv coverage (preconditioning), so
+        that sparsely and densely sampled spatial frequencies converge at the same rate. It changes
+        the number of iterations, not the image.
 
     databound : {'adapt', 'weights', 'fixed'}, default 'adapt'
-        The norm of the residual of each block of data is kept below a bound:
-          'adapt'    start from a positive least-squares fit and follow the residual where it settles
-                     elsewhere, up or down, but not below the noise that successive integrations show. Right where weights are only relative
-                     or calibration errors exceed the thermal noise.
-          'weights'  what the weights say (chi-square and two standard deviations), held fixed. Right where the weights are the true inverse
-                     variances and calibration errors are negligible.
-          'fixed'    multiples of what the weights say, given by l2bound.
+        The residual of each block of data must agree with its noise: its norm is kept below a bound.
+          'adapt'    the noise of each block is estimated: the bound starts from a non-negative
+                     least-squares fit (NNLS) and follows the residual, up or down, but not below the
+                     thermal noise measured from differences of successive integrations. Right where
+                     the weights are only relative, or where calibration errors exceed the thermal
+                     noise.
+          'weights'  the noise given by the MS weights (the expected chi-square plus two standard
+                     deviations), held fixed. Right where the weights are the true inverse variances
+                     and calibration errors are negligible.
+          'fixed'    multiples of the noise given by the MS weights, set by l2bound.
 
     boundtol : float, default 0.01
         Opened by databound = 'adapt'.
-        A block whose residual norm is this close to its bound, relatively, keeps it. (gamma_2 of
-        the paper.)
+        A bound is kept while the residual norm differs from it by less than this fraction. (gamma_2
+        of the paper.)
 
     boundrelchange : float, default 0.01
         Opened by databound = 'adapt'.
-        Bounds move only while the model changes by less than this, relatively, in one iteration.
+        Bounds change only while the relative change of the model in one iteration is below this.
         (gamma_1 of the paper.)
 
     boundstep : float, default 0.618
@@ -461,61 +473,65 @@ class _tsara:
 
     boundinterval : int, default 20
         Opened by databound = 'adapt'.
-        The bound of a block stays for at least this many iterations. (P of the paper.)
+        The bound of a block is kept for at least this many iterations. (P of the paper.)
 
     l2bound : list of float, default []
         Opened by databound = 'fixed'.
-        One value for all blocks, or one for each in the order of the returned dictionary. 1.0 takes
-        the weights at their word, 1.2 allows for 20 % more noise.
+        One value for all blocks, or one for each, in the order of the blocks in the returned
+        dictionary. 1.0 is the noise given by the MS weights, 1/sqrt(WEIGHT); 1.2 allows for 20 %
+        more.
         Examples: l2bound=1.2
                   l2bound=[1.0, 1.0, 1.35, 1.1]
 
     nreweights : int, default 20
-        After each convergence the sparsity weights are renewed from the model: coefficients that
-        stand out are penalised less, and the solver goes on. This recovers faint sources and
-        fluxes that a plain l1 norm suppresses. 0 leaves the weights equal.
+        After each convergence the weights of the l1 norm are computed anew from the model: large
+        coefficients are penalised less, and the solver continues. This recovers faint sources and the
+        flux that an unweighted l1 norm suppresses. 0 keeps all weights equal. (These weights are not
+        the weights of the data.)
 
     reweightdecay : float, default 0.618
         Opened by nreweights = other than 0.
-        The scale that separates penalised from freed coefficients shrinks by this factor each
-        time. (omega of the paper.)
+        The scale that separates penalised from nearly unpenalised coefficients decreases by this
+        factor at each re-weighting. (omega of the paper.)
 
     reweighttol : float, default 0.01
         Opened by nreweights = other than 0.
-        Re-weighting ends when one more changes the model by less than this, relatively, and every
-        bound is met, or nearly met where it is less than half of this. (The varrho of the paper.)
+        Re-weighting ends when the relative change of the model between two re-weightings is below
+        this and every bound is met (nearly met, where the change is below half of this). (varrho of
+        the paper.)
 
     reltol : float, default 0.0003
-        Where every bound on the data is met too, the next re-weighting starts; otherwise after 30
-        iterations (60 of the first).
+        The next re-weighting starts when the change is below this and every bound is met, or else
+        after 30 iterations (60 before the first).
 
     finalreltol : float, default 0.0003
-        The tolerance of the last run, in place of reltol.
+        Used in place of reltol after the last re-weighting.
 
     regscale : float, default 1.0
-        The weight of the sparsity prior against the data: 1 is the noise of one coefficient of the
-        gradient of the data, from the noise levels found and the weights. Larger values give a smoother
-        image; smaller ones follow the noise.
+        The weight of the sparsity prior relative to the data. 1 is the automatic weight, which
+        follows from the noise of the data. Larger values give a smoother image; smaller values fit
+        more of the noise.
 
     significance : float, default 5.0
-        The model is zero where the data show no emission of this many standard deviations, at the
-        resolution of the natural beam or smoothed to 1, 2, 4 or 8 beams, so that extended emission
-        counts with its sum. Where a source is found, its surroundings belong to it down to half of that.
-        A source that one point explains is modelled as a point, between pixels. Where the residual image is noisier than
-        the visibilities (calibration errors), the standard deviation is that of the residual image.
-        The islands of emission are listed in the log and in the record, with flux, error and
-        signal-to-noise ratio. It is looked for at every re-weighting (nreweights). 0 leaves the model free
-        everywhere: at low signal-to-noise ratios it then holds the positive half of the noise.
+        The model is zero where no emission of this many standard deviations is detected, either at
+        the resolution of the naturally weighted beam or smoothed to 1, 2, 4 or 8 beams, so that faint
+        extended emission is detected too. Around a detected source the model extends to where the
+        emission falls below half of this. A source that is consistent with a point is modelled as
+        one, at its position between pixels. Where the residual image is noisier than the visibilities
+        imply (calibration errors), the standard deviation is that of the residual image. The log and
+        the record list the detected islands of emission with flux, error and signal-to-noise ratio.
+        Detection is repeated at every re-weighting (nreweights). With 0 the model is free everywhere;
+        at low signal-to-noise ratios it then also contains the positive peaks of the noise.
 
     blocks : int or str or list of str, default 0
-        0 makes one block of each MeasurementSet, observation and scan, and splits long scans in
-        time, so that every snapshot, with its own calibration errors, finds its own noise level.
-        Another number cuts the data, in the order of time, into that many blocks of about one size.
-        A list sets data apart whose noise is known to differ: each entry names some, by the words of
-        the data selection (field, spw, timerange, uvrange, antenna, scan, observation, intent) and
-        vis, the number of the MeasurementSet; several words in one entry must all hold. What an entry
-        names, and the rest, is split into snapshots each by itself; where entries overlap the first
-        has the data. An entry that names nothing is refused.
+        0 makes one block of each MeasurementSet, observation and scan, and splits long scans in time,
+        so that every snapshot, with its own calibration errors, finds its own noise level. Another
+        number divides the data in time into that many blocks of nearly equal size. A list separates
+        data whose noise is known to differ. Each entry selects some of them with the data selection
+        parameters (field, spw, timerange, uvrange, antenna, scan, observation, intent) and vis, the
+        number of the MeasurementSet; an entry with several parameters selects what meets all of them.
+        The data of each entry, and the remaining data, are divided into snapshots separately; data
+        selected by several entries belong to the first. An entry that selects nothing is refused.
         Examples: blocks=1
                   blocks='scan=3'
                   blocks=['vis=0 scan=3', 'timerange=09:14:00~09:20:00', 'spw=1', 'antenna=ea13']
@@ -524,20 +540,20 @@ class _tsara:
         Threads for the Fourier and wavelet transforms; no more than the machine has cores.
 
     dryrun : bool, default False
-        True reads the data, times a few calls of the real operators on them, logs a table and returns
-        the forecast: memory by part, whether it fits, seconds of an iteration and of the whole run.
-        Nothing is written. Without it the first lines of the log tell the memory, and the line
-        after the first iterations the time.
+        True reads the data, times a few calls of the operators on them, writes a table to the log and
+        returns the forecast: memory by part, whether it fits, seconds of an iteration and of the
+        whole run. No images are written. In a normal run the first lines of the log give the memory,
+        and a line after the fourth iteration the time.
 
     maxmem : float, default 0.0
         A run that would hold more than this (1 GB = 1e9 bytes, Python and CASA included) is refused
-        before it begins, with the sizes that would fit. 0 takes what the machine and the control
-        groups of the process leave.
+        before it begins, with the sizes that would fit. 0 takes all that the machine, and the control
+        groups of the process, have available.
 
     maxtime : str or int or float, default ''
-        The iterations end early enough for the images to be written in time, and the best image so
-        far is the result, with stop code 107. Reading the data and at least 10 iterations of the
-        first fit are always done.
+        The iterations end early enough to write the images in time; the result is the model at that
+        point, with stop code 107. Reading the data and at least 10 iterations of the first fit are
+        always done.
         Examples: maxtime='90min'
                   maxtime=30    (minutes)
 
@@ -551,34 +567,35 @@ class _tsara:
         beside it. The task saracompare writes the same for several images.
 
     restart : bool, default False
-        True goes on with a run that has not finished, because it was killed, the machine went down,
-        or Ctrl-C ended it: from imagename.checkpoint, which is written every minute or so, and to
-        the same image as without the interruption. It takes the same data and the same parameters
-        (nthreads and those of the weighting, the restoration and the output are free; the
-        MeasurementSets may have been moved); another checkpoint is refused, and what differs is
-        said. Where there is no checkpoint, True starts from imagename.model, which must have the
-        shape and coordinates asked for; where there is none either, from the beginning. The
-        products are replaced. With niter=0 and savemodel='modelcolumn' they stay as they are, and
-        only the column is written. False starts afresh.
+        True continues a run that was killed, was stopped with Ctrl-C, or whose machine went down. It
+        starts from imagename.checkpoint, which is written about every minute, and leads to the same
+        image as a run without interruption. It takes the same data and the same parameters (nthreads
+        and those of the weighting, the restoration and the output are free; the MeasurementSets may
+        have been moved); another checkpoint is refused, with what differs. Where there is no
+        checkpoint, True starts from imagename.model, which must have the shape and coordinates asked
+        for; where there is none either, from the beginning. The products are replaced. With niter=0
+        and savemodel='modelcolumn' they are kept, and only the column is written. False starts anew.
 
     overwrite : bool, default False
-        True lets the task replace products of an earlier run with the same imagename, and its
-        checkpoint when it has not finished: when there are new ones. False refuses to start when
-        there are any, unless restart=True.
+        True replaces products of an earlier run with the same imagename, and the checkpoint of an
+        unfinished one, when the new products are complete. False refuses to start when there are any,
+        unless restart=True.
 
     savemodel : {'none', 'modelcolumn'}, default 'none'
-        'modelcolumn' writes the visibilities of the model into MODEL_DATA of each MeasurementSet,
-        for self-calibration, when the images are complete. 'none' leaves the MeasurementSets
+        'modelcolumn' writes the visibilities of the model into MODEL_DATA of each MeasurementSet, for
+        self-calibration, after the images have been written. 'none' leaves the MeasurementSets
         untouched. Together with restart=True and niter=0 it writes the visibilities of the existing
-        imagename.model and leaves the images as they are: also where a run was killed in this phase.
+        imagename.model and keeps the images, for example after a run was killed while it wrote the
+        column.
 
     parallel : bool, default False
-        True shares data, wavelets and memory among the processes (ranks) of an MPI job, on one machine or several; the
-        image is the same. Start the script with "mpirun -n 4 python script.py", where every rank calls the
-        task, or with "mpicasa -n 5 casa -c script.py", where casampi's client has its servers do it. It
-        takes mpi4py (pip install casa_sara[mpi]) and Open MPI or MPICH. nthreads, and maxmem, are those
-        of each rank; nthreads=0 shares the cores of a machine among its ranks. See docs/parallel.md.
-        False runs in one process, with nthreads threads.
+        True shares data, wavelets and memory among the processes (ranks) of an MPI job, on one
+        machine or several; the image is the same. Start the script with "mpirun -n 4 python
+        script.py", where every rank calls the task, or with "mpicasa -n 5 casa -c script.py", where
+        casampi's client has its servers do it. It takes mpi4py (pip install casa_sara[mpi]) and Open
+        MPI or MPICH. nthreads, and maxmem, are those of each rank; nthreads=0 shares the cores of a
+        machine among its ranks. See docs/parallel.md. False runs in one process, with nthreads
+        threads.
 
     Returns
     -------
@@ -588,9 +605,10 @@ class _tsara:
       user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit,
       108 converged but the residual is not noise (more than 5 sigma over a beam or more).
       The key 'sara' holds its own record: the islands of emission ('islands': place, flux with its
-      error, S/N, size), the largest S/N of the residual by width ('residual_snr'), the bound of each block with its snapshot, the history of re-weightings and iterations, the
-      parameters that were chosen automatically and why, how many samples were dropped for
-      which reason, and the iterations from which the run was resumed ('resumed').
+      error, S/N, size), the largest S/N of the residual by width ('residual_snr'), the noise and
+      bound of each block with its snapshot ('blocks'), the history of re-weightings and iterations,
+      the parameters that were chosen automatically and why, how many samples were left out for which
+      reason ('dropped'), and the iterations from which the run was resumed ('resumed').
 
     Examples
     --------
@@ -615,7 +633,7 @@ class _tsara:
     """
 
     _info_group_ = 'imaging'
-    _info_desc_ = 'Image MeasurementSets with SARA: sparse, positive, faithful to the data within the noise'
+    _info_desc_ = 'Image MeasurementSets with SARA: sparse, non-negative, consistent with the data to within the noise'
 
     def __call__(
         self, vis='', selectdata=True, field='', spw='', timerange='', uvrange='', antenna='', scan='', observation='',

@@ -1,4 +1,4 @@
-"""Reading the picture of the calibration: wrong weights, and one bad antenna in one scan, found by tsara.
+"""Reading the noise plot: wrong weights, and one bad antenna in one scan, found by tsara.
 
     python docs/tutorials/calibration_quality.py [folder]
 
@@ -22,7 +22,7 @@ NOISE_DB = 30.0
 GAIN_RMS = 0.002
 SIZE, CELL_ARCSEC = (160, 80), 0.2
 BAD_SCAN, BAD_ANTENNA, BAD_GAIN = 4, 9, 1.2  # in the first MeasurementSet
-WEIGHTS_TOO_HIGH = 4.0  # in the second: its noise is twice what its weights say
+WEIGHTS_TOO_HIGH = 4.0  # in the second: its noise is 2 x MS weights
 
 
 def simulate(folder):

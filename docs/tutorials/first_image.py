@@ -58,7 +58,7 @@ def as_text(truth, forecast, result, images):
         f"flux of the model   {model.sum():.2f} Jy (truth {truth.sum():.2f} Jy)",
         f"SNR of the model    {snr_at_scale(truth, model, BEAM_ARCSEC / CELL_ARCSEC):.1f} dB at the beam, 0.8 arcsec",
         f"dynamic range       {images['image'].max() / images['residual'].std():.0f}",
-        f"noise, {len(blocks)} snapshots  {min(found):.2f} to {max(found):.2f} times what the weights say",
+        f"noise, {len(blocks)} snapshots  {min(found):.2f} to {max(found):.2f} x MS weights",
     ])
 
 

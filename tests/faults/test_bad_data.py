@@ -169,7 +169,7 @@ def test_one_of_several_may_be_empty(vis, copy, whole_model, tmp_path):
     for names in ([vis, copy], [copy, vis]):
         model, record = image(names, tmp_path)
         assert_same(model, whole_model)
-        assert any(f"no sample of '{copy}' can be used" in note for note in record["notes"])
+        assert any(f"'{copy}' has no usable visibilities" in note for note in record["notes"])
     assert_refused([vis, copy], tmp_path, "scan = '9'.*; scan = '7'", scan=["9", "7"], imagename=str(tmp_path / "none"))
 
 

@@ -73,7 +73,8 @@ def test_the_other_hand_is_used_with_its_weight(copy, where, value):
     alone = {("LL", "RR")[hand]: 3 * np.arange(ROWS)[rows].size for hand, rows in WHERE[where]}
     assert ours.alone == alone
     for name, count in alone.items():
-        assert any(f"{count} samples are of {name} alone, because the other hand has no weight" in note for note in ours.notes)
+        assert any(f"{count} samples use {name} alone, because the other correlation has no weight" in note
+               for note in ours.notes)
 
 
 def test_images_and_the_sum_of_weights_are_those_of_the_other_hand(copy):
