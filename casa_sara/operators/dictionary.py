@@ -153,9 +153,9 @@ class SaraDictionary:
     def dual_step(self, model_bar, dual, threshold, weights=None, out=None, relaxation=1.0):
         """Update the dual variable of the prior in place and return Ψ dual, in one sweep over the bases.
 
-        With u = dual + Ψ† model_bar,
+        With c = dual + Ψ† model_bar,
 
-            dual ← dual + ρ(clip(u, ± threshold·weights) − dual),   clip(u, ± t) = u − soft(u, t),
+            dual ← dual + ρ(clip(c, ± threshold·weights) − dual),   clip(c, ± t) = c − soft(c, t),
 
         the proximal operator of the conjugate of threshold·‖weights · ‖₁ (Moreau), relaxed by ρ.
 

@@ -125,7 +125,7 @@ class PaperBounds:
         nearer = schedule.gamma_3 * ppd.residual_norms + (1 - schedule.gamma_3) * self.l2_bounds
         self.l2_bounds = np.where(move, nearer, self.l2_bounds)
         self._moved[move] = ppd.iteration
-        ppd.l2_bounds = self.l2_bounds
+        ppd.constrain(self.l2_bounds)
         return bool(move.any())
 
     def met_by(self, ppd, schedule):
@@ -199,9 +199,8 @@ def solve(ppd, bounds, schedule=PaperSchedule(), progress=lambda ppd, record: No
     if stage is None:
         stage = PaperStage(ppd.model.copy())
         stage.record.bounds.append((0, bounds.l2_bounds.copy()))
-        ppd.l1_weights = ppd.dictionary.allocate()
-        ppd.l1_weights[...] = 1  # W⁽⁰⁾
-    ppd.l2_bounds, ppd.dictionary.norm, record = bounds.l2_bounds, stage.norm, stage.record
+    ppd.constrain(bounds.l2_bounds)
+    ppd.dictionary.norm, record = stage.norm, stage.record
     while True:
         stage.last = stage.last or stage.k >= schedule.reweightings
         record.stop_code = _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep)
@@ -217,9 +216,9 @@ def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
     """Algorithm 1 for one set of weights; return its stop code."""
     tolerance, record = schedule.final_reltol if stage.last else schedule.reltol, stage.record
     while True:
-        ppd.step()
+        ppd.step()  # Steps 5–6 and 11–19
         record.note(ppd, stage.k)
-        moved = bounds.adapt(ppd, schedule)
+        moved = bounds.adapt(ppd, schedule)  # Steps 7–10
         if moved:
             record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))
         progress(ppd, record)

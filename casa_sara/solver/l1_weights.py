@@ -69,8 +69,6 @@ def first_weights(ppd, bounds, confined=False):
     Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
     threshold at the noise of one pixel would let it through.
     """
-    if ppd.l1_weights is None:
-        ppd.l1_weights = ppd.dictionary.allocate()
     noise, pixel = band_noise(ppd, bounds)
     for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel) * _shares(ppd, confined)):
         ppd.l1_weights[band.slice] = scale

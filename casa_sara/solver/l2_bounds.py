@@ -85,8 +85,7 @@ class _NoiseLevels:
 
     def apply_to(self, ppd):
         """Hand the multipliers to the iteration, for its current κ."""
-        ppd.l2_bounds = None
-        ppd.multipliers[:] = ppd.threshold / (ppd.l2_step * self.gradient_noise) * self.noise_weights
+        ppd.penalise(ppd.threshold / (ppd.l2_step * self.gradient_noise) * self.noise_weights)
 
     def state(self):
         """Return what has changed since the start."""
@@ -105,7 +104,7 @@ class GivenBounds(_NoiseLevels):
 
     def finish(self, ppd):
         """Make the bounds hard constraints, from where the multipliers have led."""
-        ppd.l2_bounds = self.l2_bounds
+        ppd.constrain(self.l2_bounds)
 
     def adapt(self, ppd):
         """Nothing adapts; return False."""
@@ -113,7 +112,7 @@ class GivenBounds(_NoiseLevels):
 
     def met_by(self, ppd, slack=1.0):
         """Whether every block's residual is inside its bound, but for a relative 1e-3 × slack."""
-        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3 * slack)))
+        return not ppd.constrained or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3 * slack)))
 
 
 @dataclass

@@ -13,12 +13,12 @@ __all__ = ["ellipsoid_multiplier", "project_ellipsoid"]
 def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, start=0, stop=None, tol=1e-10, comm=SERIAL):
     """Lagrange multiplier of the projection onto one data ellipsoid.
 
-    The projection of s = U⁻¹v + Φx̄ in the metric U onto {z : ‖z − y‖ ≤ ε} is
+    The projection of s = U⁻¹v + Φx̄ in the metric U onto {q : ‖q − y‖ ≤ ε} is
 
-        z − y = U(s − y)/(U + λ),   with λ ≥ 0 the root of ‖z − y‖ = ε,
+        q − y = U(s − y)/(U + λ),   with λ ≥ 0 the root of n = ‖q − y‖ = ε,
 
-    and λ = 0 where s lies inside.  1/‖z − y‖ is concave and increasing in λ, nearly a straight line, so
-    Newton's iteration on 1/‖z − y‖ − 1/ε converges from any start in a few steps.
+    and λ = 0 where s lies inside.  1/n is concave and increasing in λ, nearly a straight line, so
+    Newton's iteration on 1/n − 1/ε converges from any start in a few steps.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def _norms(comm, *arguments):
 
 
 def project_ellipsoid(point, centre, precond, bound):
-    """Projection of `point` in the metric U onto the ball {z : ‖z − centre‖ ≤ bound}.
+    """Projection of `point` in the metric U onto the ball {q : ‖q − centre‖ ≤ bound}.
 
     Parameters
     ----------

@@ -189,9 +189,9 @@ def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
     tolerance = schedule.final_reltol if stage.last else schedule.reltol
     record = stage.record
     while True:
-        ppd.step()
+        ppd.step()  # Steps 5–6 and 11–19
         record.note(ppd, stage.k)
-        if bounds.adapt(ppd):
+        if bounds.adapt(ppd):  # Steps 7–10
             record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))
         progress(ppd, record)
         if not np.isfinite(ppd.rel_change) or not np.isfinite(record.residual_norm[-1]):
