@@ -29,10 +29,11 @@ from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Spectrum, Weighting
 from casa_sara.parallel import SERIAL
+from casa_sara.problem import Samples
 from casa_sara.reconstruction import Reconstruction, operator_accuracy, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import UNFINISHED
-from casa_sara.solving import Watch, checkpoint_of, list_islands, solve_image, without_wild
+from casa_sara.solving import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import BlockInfo, Visibilities, sort_into_blocks
 from casa_sara.warmup import kernels_loading
@@ -154,9 +155,9 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
         reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
         if options.niter > 0:
             deadline.reserve = _after_iterations(comm.total(data.size), grid, output, limits, deadline.elapsed())
-            watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
-            reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch, support,
-                                         crew)
+            watch = Watch(deadline, Pace(schedule_of(options).expected_iterations), checkpoint)
+            samples = Samples(data, offsets, density_of(data, selection, grid, options, comm), noise)
+            reconstruction = solve_image(samples, grid, options, start, watch, support, crew)
             forecast = replace(forecast, iteration_s=watch.pace.seconds)
             model = reconstruction.model
             list_islands(reconstruction.record, plane, grid.cell_rad, options.significance, comm)

@@ -46,7 +46,7 @@ def block_norms(problem, problem_of, options, stopped):
             norms.append(0.0)
             continue
         chosen = np.arange(start, stop)
-        alone = Samples(samples.data.take(chosen), np.array([0, stop - start]), samples.density[chosen], chosen)
+        alone = Samples(samples.data.take(chosen), np.array([0, stop - start]), samples.density[chosen])
         block = problem_of(alone, options=plain)
         _, residual = nnls(block.measurement, block.vis, block.precond, block.data_norm_sq, schedule.nnls_iterations,
                            last_penalty=0, positivity=options.positivity, stopped=stopped, support=block.support,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -23,19 +23,40 @@ LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 @dataclass
 class Samples:
-    """The samples in use, by blocks, and their numbers `kept` in the data given."""
+    """Block-sorted samples: all that were given, or those in use. Of several ranks each has its own.
+
+    Attributes
+    ----------
+    data : Visibilities
+        `vis` (Jy), `weight` (inverse variance) and `uvw` are used.
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    density : real (M,)
+        Sampling density of each sample; U = 1/density is the preconditioner.
+    noise : float (d,), optional
+        Noise of each block measured from the data, in units of what the weights say; NaN where unknown.
+    kept : int (M,)
+        Numbers of the samples in the data given.
+    """
 
     data: Visibilities
     offsets: np.ndarray
     density: np.ndarray
-    kept: np.ndarray
+    noise: np.ndarray | None = None
+    kept: np.ndarray = field(default=None)
+
+    def __post_init__(self):
+        self.offsets = np.asarray(self.offsets)
+        if self.kept is None:
+            self.kept = np.arange(self.data.size)
 
     def without(self, index):
         """Leave out samples, numbered as they are here."""
         if len(index) == 0:
             return self
         good = np.delete(np.arange(self.data.size), index)
-        return Samples(self.data.take(good), np.searchsorted(good, self.offsets), self.density[good], self.kept[good])
+        return replace(self, data=self.data.take(good), offsets=np.searchsorted(good, self.offsets),
+                       density=self.density[good], kept=self.kept[good])
 
 
 @dataclass
@@ -111,24 +132,28 @@ def first_image(samples, problem_of, options, stopped=lambda: False, comm=SERIAL
         In `problem.unit_jy`.
     """
     everything, wild, layout = samples.data.size, [], Layout(samples.offsets, comm)
+    problem = problem_of(samples)
     for _ in range(ROUNDS):
-        problem = problem_of(samples)
         first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                                positivity=options.positivity, stopped=stopped, support=problem.support)
+        samples = problem.samples
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
-        count = comm.total(found.index.size)
-        if count == 0:
+        if comm.total(found.index.size) == 0:
             break
-        named = zip(layout.numbers(samples.kept[found.index]).tolist(), found.named(samples.data))
-        wild += [words for _, words in sorted(sum(comm.gather(list(named)), []), key=lambda one: one[0])]
-        samples = samples.without(found.index)
-    if count:
-        problem, residual = problem_of(samples), np.delete(residual, found.index)
+        wild += _told_of_all(found, samples, layout, comm)
+        problem, residual = problem_of(samples.without(found.index)), np.delete(residual, found.index)
+    samples = problem.samples
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
     nnls_norms = comm.norms(np.array([np.linalg.norm(residual[a:b])
                                       for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]))
     return problem, Findings(left_out, wild, nnls_norms, problem.data_norm_sq), first
+
+
+def _told_of_all(found, samples, layout, comm):
+    """Return what is told of the wild samples of all ranks, in the order in which one rank alone has them."""
+    numbered = zip(layout.numbers(samples.kept[found.index]).tolist(), found.named(samples.data))
+    return [told for _, told in sorted(sum(comm.gather(list(numbered)), []), key=lambda one: one[0])]
 
 
 def _preconditioner(samples, wanted, comm):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -14,7 +16,7 @@ from casa_sara.casa.weights import sampling_density
 from casa_sara.deadline import Deadline
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.parallel import SERIAL
-from casa_sara.reconstruction import reconstruct, schedule_of
+from casa_sara.reconstruction import Control, reconstruct, schedule_of
 from casa_sara.sharing import ALONE
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.islands import STRUCTURE
@@ -22,7 +24,7 @@ from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER,
 from casa_sara.timing import Pace
 from casa_sara.visibilities import clock
 
-__all__ = ["Watch", "checkpoint_of", "list_islands", "solve_image", "without_wild"]
+__all__ = ["Watch", "checkpoint_of", "density_of", "list_islands", "solve_image", "without_wild"]
 
 MOST_NAMED = 20  # wild samples that the log names one by one
 MOST_TOLD = 20  # islands of emission that the log lists
@@ -30,10 +32,11 @@ MOST_TOLD = 20  # islands of emission that the log lists
 
 @dataclass
 class Watch:
-    """The clocks of a solution: when it has to end, and how long an iteration takes."""
+    """When a solution has to end, how long an iteration takes, and where its state is kept, or was."""
 
     deadline: Deadline
     pace: Pace
+    checkpoint: Checkpoint
 
 
 def checkpoint_of(selection, grid, options, output):
@@ -49,26 +52,35 @@ def checkpoint_of(selection, grid, options, output):
     return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
 
 
-def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None, support=None,
-                crew=ALONE):
-    """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
+def density_of(data, selection, grid, options, comm=SERIAL):
+    """Return the sampling density of each sample, real (M,): 1 where no preconditioner is asked for.
 
     Parameters
     ----------
     data : Visibilities
-    offsets : int (d + 1,)
-        Block j is the slice offsets[j]:offsets[j + 1].
-    noise : float (d,)
-        Measured in the data, in units of what the weights say; NaN where unknown.
     selection : Selection or None
-        That gave the data, for their sampling density; None where they are but a part of it.
+        That gave the data; None where they are but a part of it.
     grid : ImageGrid
     options : SolverOptions
-    start : float32 (nx, ny), optional
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+    """
+    return sampling_density(data, selection, grid, comm) if options.precondition else np.ones(data.size, np.float32)
+
+
+def solve_image(samples, grid, options, startmodel=None, watch=None, support=None, crew=ALONE):
+    """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
+
+    Parameters
+    ----------
+    samples : Samples
+        With the sampling density (:func:`density_of`) and the noise.
+    grid : ImageGrid
+    options : SolverOptions
+    startmodel : float32 (nx, ny), optional
         First model, Jy/pixel.
-    checkpoint : Checkpoint, optional
-        Where the state is kept now and then, or was.
     watch : Watch, optional
+        Without it there is no limit of time and no checkpoint.
     support : bool (nx, ny), optional
         The model is 0 elsewhere.
     crew : casa_sara.sharing.Crew
@@ -78,26 +90,35 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     -------
     Reconstruction
     """
-    density = sampling_density(data, selection, grid, crew.comm) if options.precondition else np.ones(data.size, np.float32)
     progress = log.Progress()
-    expected = schedule_of(options).expected_iterations
-
-    def report(ppd, record):
-        begun = record.resumed[-1] if record.resumed else 0
-        if watch and (words := watch.pace(ppd.iteration - begun)):
-            log.info(words)
-        fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-        progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
-                 f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
-
+    report = partial(_report, progress, schedule_of(options).expected_iterations, watch.pace if watch else None)
     with stop_on_interrupt() as pressed:
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report,
-                                     lambda: bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0]),
-                                     checkpoint, support, crew)
+        def stopped():
+            return bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0])
+
+        control = Control(report, stopped, watch.checkpoint if watch else None)
+        reconstruction = reconstruct(samples, grid, options, startmodel, control, support, crew)
     progress.close()
     record = reconstruction.record
     if record.stop_code == STOPPED_BY_USER and not crew.comm.broadcast(pressed()):
         record.stop_code = TIME_LIMIT
+    _tell_end(reconstruction, control.checkpoint)
+    return reconstruction
+
+
+def _report(progress: log.Progress, expected: int, pace: Callable[[int], str] | None, ppd, record):
+    """Show how far the solution is, after every iteration of `expected` ones."""
+    begun = record.resumed[-1] if record.resumed else 0
+    if pace and (words := pace(ppd.iteration - begun)):
+        log.info(words)
+    fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
+    progress(ppd.iteration, f"{record.reweighting[-1]} re-weightings, relative change {ppd.rel_change:.1e}, "
+             f"flux {record.model_flux[-1]:.5g} Jy, residual norm {record.residual_norm[-1]:.5g}", fraction)
+
+
+def _tell_end(reconstruction, checkpoint):
+    """Say in the log why the solution ended and what it found."""
+    record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     say(f"{record.stop_description}: {record.iteration[-1]} iterations, {record.reweighting[-1]} re-weightings")
     if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
@@ -107,7 +128,6 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
         log.info(f"{released} pixels beside unresolved sources were allowed to be negative: the sources are between pixels")
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: l2 bound {bound:.5g}, residual {norm:.5g} (whitened)")
-    return reconstruction
 
 
 def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):

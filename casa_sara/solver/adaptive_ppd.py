@@ -13,8 +13,9 @@ from casa_sara.solver.statefile import fill
 __all__ = ["BASIS_ARRAYS", "SAMPLE_ARRAYS", "AdaptivePPD"]
 
 RELAXATION = 1.8
-# τ < ½: the iteration converges for τ(η‖U^½Φ‖² + ζ‖Ψ‖²) < 1, at any 0 < ρ < 2 (Condat 2013). With η = 1/‖U^½Φ‖² and
-# ζ = 1/‖Ψ‖² the bracket is 2 (or less: the norms are known from above). The paper gives no number; this is 1 % below the limit.
+# τ: the iteration converges for τ(η‖U^½Φ‖² + ζ‖Ψ‖²) < 1, at any 0 < ρ < 2 (Condat 2013). With η = 1/‖U^½Φ‖² and
+# ζ = 1/‖Ψ‖² the bracket is 2, or less where a norm is known from above only. The paper gives no number; this is 1 %
+# below the limit.
 STEP = 0.495
 PIECE = 4096  # samples of a block that one thread works on: sums are the same for any number of threads
 STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor",
@@ -41,8 +42,8 @@ class AdaptivePPD:
     :class:`casa_sara.solver.l2_bounds.AdaptiveBounds` and of :class:`casa_sara.solver.dabbech2018.PaperBounds`.
 
     Steps 5, 13 and 17 are over-relaxed: v ← v + ρ(ṽ − v), u ← u + ρ(ũ − u) with ṽ, ũ what the table says, and the
-    image's step starts from the anchor z ← z + ρ(x − z), so that x̄ = 2x − z.  ρ = 1 is the table itself (z = x_prev); any
-    0 < ρ < 2 has the same fixed points and converges under the same condition on the steps (Condat 2013).
+    image's step starts from the anchor z ← z + ρ(x − z), so that x̄ = 2x − z.  ρ = 1 is the table itself (z = x_prev);
+    any 0 < ρ < 2 has the same fixed points and converges under the same condition on the steps (Condat 2013).
 
     Step 6 needs Φx, but one Φ per iteration is enough: from x̄ = 2x − z follows Φx = ½(Φx̄ + Φz), and Φz follows z by
     Φz ← Φz + ρ(Φx − Φz).
@@ -53,8 +54,8 @@ class AdaptivePPD:
     :mod:`casa_sara.solver.l2_bounds` for how a noise level fixes a multiplier.
 
     The weights W stand in the threshold κW of Step 13, with u the dual variable of Ψ†x.  The paper has them in the
-    operator WΨ†, with u that of WΨ†x; the problem is the same.  Here ‖Ψ‖ = 1 whatever the weights are, so that neither the
-    steps nor the meaning of u change when the weights do.
+    operator WΨ†, with u that of WΨ†x; the problem is the same.  Here ‖Ψ‖ = 1 whatever the weights are, so that neither
+    the steps nor the meaning of u change when the weights do.
 
     Parameters
     ----------
@@ -212,7 +213,7 @@ class AdaptivePPD:
         self.iteration += 1
 
     def _update_data_dual(self):
-        """Steps 5–6: v from Φx̄, its gradient Φ†v, and μ_j²; return a function that waits for their sums over the ranks."""
+        """Steps 5–6: v from Φx̄, its gradient Φ†v, and μ_j²; return a function that waits for its sum over the ranks."""
         self.measurement.forward(self.model_bar, self._phi_bar)
         if self.constrained:
             self._update_multipliers()
@@ -228,8 +229,9 @@ class AdaptivePPD:
     def _update_multipliers(self):
         """P_{E_j} of Step 5: the λ_j for which ‖q_j − y_j‖ = ε_j, from those of the iteration before."""
         for j, (start, stop) in enumerate(self.blocks()):
-            self.multipliers[j] = ellipsoid_multiplier(self.l2_dual, self._phi_bar, self.vis, self.precond, self.l2_bounds[j],
-                                                       self.multipliers[j], start, stop, comm=self.comm)
+            self.multipliers[j] = ellipsoid_multiplier(
+                self.l2_dual, self._phi_bar, self.vis, self.precond, self.l2_bounds[j], self.multipliers[j], start, stop,
+                comm=self.comm)
 
     def _update_prior_dual(self):
         """Step 13: u from Ψ†x̄, and its gradient Ψu."""
