@@ -97,7 +97,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
 
 
 def _common_plane(sets, notes):
-    """Return the grid of the first model, upright; if a model is turned, without the edges that not all images reach."""
+    """Return the grid of the first model, upright; if one is turned, without the edges that not all images reach."""
     plane = sets[0].model.plane.upright()
     turned = any(one.model.plane.upright() is not one.model.plane for one in sets)
     return _covered(plane, sets, notes) if turned else plane

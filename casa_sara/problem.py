@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from casa_sara.operators.measurement import MeasurementOperator, Summed
+from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
 from casa_sara.operators.sky import sky_operator
+from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.outliers import find_wild
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 from casa_sara.sharing import Layout
+from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import nnls
 from casa_sara.visibilities import Visibilities
 
@@ -43,14 +46,14 @@ class Samples:
     offsets: np.ndarray
     density: np.ndarray
     noise: np.ndarray | None = None
-    kept: np.ndarray = field(default=None)
+    kept: np.ndarray = field(default=None)  # type: ignore[arg-type]  # all of them: see below
 
     def __post_init__(self):
         self.offsets = np.asarray(self.offsets)
         if self.kept is None:
             self.kept = np.arange(self.data.size)
 
-    def without(self, index):
+    def without(self, index: np.ndarray) -> Samples:
         """Leave out samples, numbered as they are here."""
         if len(index) == 0:
             return self
@@ -83,14 +86,15 @@ class Problem:
 
     samples: Samples
     vis: np.ndarray
-    measurement: MeasurementOperator
+    measurement: Measurement
     precond: np.ndarray
     data_norm_sq: float
     unit_jy: float
     support: np.ndarray | None = None
 
     @classmethod
-    def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None, support=None, comm=SERIAL):
+    def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions, unit_jy: float, eps: float,
+           data_norm_sq: float | None = None, support: np.ndarray | None = None, comm: Serial = SERIAL) -> Problem:
         """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`.
 
         Its norm is measured unless given.
@@ -109,7 +113,9 @@ class Problem:
         return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support)
 
 
-def first_image(samples, problem_of, options, stopped=lambda: False, comm=SERIAL):
+def first_image(samples: Samples, problem_of: Callable[..., Problem], options: SolverOptions,
+                stopped: Callable[[], bool] = lambda: False,
+                comm: Serial = SERIAL) -> tuple[Problem, Findings, np.ndarray]:
     """Find the image of positivity and a vanishing sparsity alone, where the bounds start, and the model too.
 
     Parameters

@@ -10,10 +10,11 @@ import numpy as np
 
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
+from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.papermethod import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 from casa_sara.problem import Findings, Problem, Samples, first_image
-from casa_sara.sharing import ALONE, Layout
+from casa_sara.sharing import ALONE, Crew, Layout
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve as solve_as_in_the_paper
@@ -21,6 +22,7 @@ from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_b
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, solve
 from casa_sara.solver.statefile import digest
+from casa_sara.visibilities import Visibilities
 
 __all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
 
@@ -88,7 +90,9 @@ class Reconstruction:
     wild: list[dict]
 
 
-def reconstruct(samples, grid, options, startmodel=None, control=Control(), support=None, crew=ALONE):
+def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
+                control: Control = Control(), support: np.ndarray | None = None,
+                crew: Crew = ALONE) -> Reconstruction:
     """Find the SARA image of block-sorted visibilities.
 
     Parameters
@@ -179,7 +183,8 @@ def _result(solution, record, samples, comm):
     return Reconstruction(
         model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
-        noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out), wild=found.wild)
+        noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
+        wild=found.wild)
 
 
 @dataclass
@@ -258,7 +263,7 @@ def _resume(samples, layout, problem_of, options, checkpoint, crew):
     return solution
 
 
-def check_l2bound(options, blocks):
+def check_l2bound(options: SolverOptions, blocks: int) -> None:
     """Raise ValueError where the noise levels given are not one for all blocks, or one for each."""
     if options.databound == "fixed" and len(options.l2bound) not in (1, blocks):
         raise ValueError(f"l2bound = {list(options.l2bound)}: there are {blocks} blocks; give one noise level "
@@ -274,7 +279,8 @@ def _plain_state(state, comm):
     return state | dict(ppd=state["ppd"] | {name: spread.get(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)})
 
 
-def operator_accuracy(data, offsets, noise, comm=SERIAL):
+def operator_accuracy(data: Visibilities, offsets: np.ndarray, noise: np.ndarray | None,
+                      comm: Serial = SERIAL) -> float:
     """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown."""
     if noise is None or not np.all(np.asarray(noise) > 0):
         return SMALLEST_EPS[np.dtype(np.float32)]
@@ -282,7 +288,7 @@ def operator_accuracy(data, offsets, noise, comm=SERIAL):
     return choose_eps(data.vis, data.weight / level**2, comm=comm)
 
 
-def schedule_of(options):
+def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
     """The solver's schedule for these task parameters."""
     if options.method == PAPER:
         return PaperSchedule.of(options)

@@ -11,18 +11,21 @@ import numpy as np
 import casa_sara
 from casa_sara.casa import log
 from casa_sara.casa.catalogue import located
+from casa_sara.casa.imageplane import ImagePlane
 from casa_sara.casa.products import CHECKPOINT
 from casa_sara.casa.weights import sampling_density
 from casa_sara.deadline import Deadline
 from casa_sara.interrupt import stop_on_interrupt
-from casa_sara.parallel import SERIAL
-from casa_sara.reconstruction import Control, reconstruct, schedule_of
-from casa_sara.sharing import ALONE
+from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
+from casa_sara.parallel import SERIAL, Serial
+from casa_sara.problem import Samples
+from casa_sara.reconstruction import Control, Reconstruction, reconstruct, schedule_of
+from casa_sara.sharing import ALONE, Crew
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.islands import STRUCTURE
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED, SolverRecord
 from casa_sara.timing import Pace
-from casa_sara.visibilities import clock
+from casa_sara.visibilities import BlockInfo, Visibilities, clock
 
 __all__ = ["Watch", "checkpoint_of", "density_of", "list_islands", "solve_image", "without_wild"]
 
@@ -39,7 +42,7 @@ class Watch:
     checkpoint: Checkpoint
 
 
-def checkpoint_of(selection, grid, options, output):
+def checkpoint_of(selection: Selection, grid: ImageGrid, options: SolverOptions, output: Output) -> Checkpoint:
     """Return the checkpoint of a run, which knows the parameters that decide the model, by the names of the task.
 
     Where the data are is none of them (they are known by their contents), nor is how many threads there are.
@@ -52,7 +55,8 @@ def checkpoint_of(selection, grid, options, output):
     return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
 
 
-def density_of(data, selection, grid, options, comm=SERIAL):
+def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid, options: SolverOptions,
+               comm: Serial = SERIAL) -> np.ndarray:
     """Return the sampling density of each sample, real (M,): 1 where no preconditioner is asked for.
 
     Parameters
@@ -68,7 +72,8 @@ def density_of(data, selection, grid, options, comm=SERIAL):
     return sampling_density(data, selection, grid, comm) if options.precondition else np.ones(data.size, np.float32)
 
 
-def solve_image(samples, grid, options, startmodel=None, watch=None, support=None, crew=ALONE):
+def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
+                watch: Watch | None = None, support: np.ndarray | None = None, crew: Crew = ALONE) -> Reconstruction:
     """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
 
     Parameters
@@ -130,7 +135,8 @@ def _tell_end(reconstruction, checkpoint):
         log.info(f"block {j}: l2 bound {bound:.5g}, residual {norm:.5g} (whitened)")
 
 
-def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):
+def without_wild(data: Visibilities, blocks: list[BlockInfo], offsets: np.ndarray, reconstruction: Reconstruction,
+                 comm: Serial = SERIAL) -> tuple[Visibilities, list[BlockInfo]]:
     """Leave out what the reconstruction left out, and say what that was."""
     wild = reconstruction.wild
     if not wild:
@@ -147,7 +153,8 @@ def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):
     return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks
 
 
-def list_islands(record, plane, cell_rad, significance, comm=SERIAL):
+def list_islands(record: SolverRecord, plane: ImagePlane, cell_rad: tuple[float, float], significance: float,
+                 comm: Serial = SERIAL) -> None:
     """Give the islands of a model their places on the sky, list them in the log, and say whether the residual is noise.
 
     Parameters

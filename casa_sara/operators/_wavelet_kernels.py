@@ -95,9 +95,9 @@ def _address(array, i):
 def _analyse(source, origin, b, level, begin, end, job, worker):
     """Lines [begin, end) of the four bands of one level; the first line of `source` is line `origin` of that image.
 
-    Two lines r, r + 1 of each band at a time, by way of eight scratch lines; s = `start` is the first pixel of a filter::
+    Two lines r, r + 1 of each band at a time, by way of eight scratch lines; a filter begins at pixel s = `start`::
 
-        source                         scratch                          coefs[b] (aa in `approx` but at the deepest level)
+        source                         scratch                        coefs[b] (aa in `approx` but at the deepest level)
         line 2r + s          ─┐        0  a[r] even pixels  ─┐                 ◀─ right ─▶
              2r + s + 1       │ across 1  a[r] odd pixels    │ along  ┌───────────┬───────────┐
                ⋮              ├──────▶ 2  d[r] even pixels   ├──────▶ │ aa, line r│ ad, line r│ ▲
@@ -105,7 +105,7 @@ def _analyse(source, origin, b, level, begin, end, job, worker):
         (`table` has their             4 … 7  the same of r + 1       │ da, line r│ dd, line r│ ▼
         addresses, periodic)                                          └───────────┴───────────┘
 
-    Each scratch line begins HALO values after its address, so that :func:`wrap` can continue it periodically.
+    The pixels of a scratch line begin at its value HALO: :func:`wrap` continues them periodically to both sides.
     """
     filters, target, work = job
     length, size = filters.lengths[b], source.itemsize

@@ -9,9 +9,11 @@ series grows with the largest phase, which therefore decides: `WTerm`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, check_cell
@@ -44,7 +46,7 @@ class WTerm:
     terms: int
 
     @classmethod
-    def of(cls, max_w, shape, cell_rad, eps):
+    def of(cls, max_w: float, shape: tuple[int, int], cell_rad: Sequence[float] | np.ndarray, eps: float) -> WTerm:
         """The way that takes least for |w| ≤ max_w, in wavelengths, an image and an accuracy."""
         depth = -float(_n_minus_1(*_cosines(shape, cell_rad, corners=True)).min())
         phase = 2 * np.pi * float(max_w) * depth
@@ -58,7 +60,9 @@ class WTerm:
         return f"w-term: turns phases by up to {self.phase:.3g} rad in this image, modelled by {way}"
 
 
-def w_operator(uvw, cell_rad, shape, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1):
+def w_operator(uvw: np.ndarray, cell_rad: npt.ArrayLike, shape: tuple[int, int],
+               row_scale: np.ndarray | None = None, eps: float = 1e-6, dtype: npt.DTypeLike = np.float32,
+               nthreads: int = 1) -> ModulatedOperator | WGridder:
     """Return the measurement operator with the w-term.
 
     Parameters
@@ -120,7 +124,8 @@ class WGridder:
         As of :func:`w_operator`.
     """
 
-    def __init__(self, uvw, cell_rad, shape, row_scale, eps, dtype, nthreads):
+    def __init__(self, uvw: np.ndarray, cell_rad: Sequence[float] | np.ndarray, shape: tuple[int, int],
+                 row_scale: np.ndarray | None, eps: float, dtype: npt.DTypeLike, nthreads: int) -> None:
         from ducc0 import wgridder  # only where it is needed
 
         check_cell(uvw[:2], cell_rad)
@@ -141,7 +146,7 @@ class WGridder:
                                         for side, n in zip(sides, self.shape))]
         self._vis = np.empty((self.size, 1), np.result_type(precise, np.complex64))
 
-    def forward(self, image, out=None):
+    def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
         if np.shape(image) != self.shape:
             raise ValueError(f"image must be of shape {self.shape}")
@@ -152,7 +157,7 @@ class WGridder:
         out[...] = self._vis[:, 0]
         return out
 
-    def adjoint(self, vis, out=None):
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
         if np.shape(vis) != (self.size,):
             raise ValueError(f"vis must be of shape ({self.size},)")

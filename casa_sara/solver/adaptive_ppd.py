@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 from casa_sara.solver import _kernels as kernels
+from casa_sara.solver.interfaces import Measurement, Prior
 from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.prox import ellipsoid_multiplier
 from casa_sara.solver.statefile import fill
@@ -119,12 +123,15 @@ class AdaptivePPD:
         Jy/pixel in the unit of the model, for the record.
     """
 
-    def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True,
-                 relaxation=RELAXATION, comm=SERIAL):
-        self.measurement, self.dictionary, self.comm = measurement, dictionary, comm
+    def __init__(self, measurement: Measurement, dictionary: Prior, vis: np.ndarray, offsets: np.ndarray,
+                 precond: np.ndarray, data_norm_sq: float, positivity: bool = True, relaxation: float = RELAXATION,
+                 comm: Serial = SERIAL) -> None:
+        self.measurement, self.comm = measurement, comm
+        self.dictionary: Any = dictionary  # Algorithm 2 of either method asks for more than a step does
         self.vis, self.precond, self.offsets = vis, precond, np.asarray(offsets)
         self.relaxation, self.positivity = relaxation, positivity
-        self.confined_to, self.points = None, PointSources()
+        self.confined_to: np.ndarray | None = None
+        self.points = PointSources()
         self.tau, self.l2_step = STEP, 1.0 / data_norm_sq
         dtype = vis.real.dtype
         self.model, self.anchor, self.model_bar, self.lowest = comm.images(4, measurement.shape, dtype)
@@ -148,31 +155,31 @@ class AdaptivePPD:
         self.unit_jy = 1.0
 
     @property
-    def scratch_vis(self):
+    def scratch_vis(self) -> np.ndarray:
         """Work space between the steps, complex (M,); each step overwrites it."""
         return self._phi_bar
 
     @property
-    def scratch_image(self):
+    def scratch_image(self) -> np.ndarray:
         """Work space between the steps, real (nx, ny); each step overwrites it."""
         return self._data_gradient
 
     @property
-    def n_blocks(self):
+    def n_blocks(self) -> int:
         """Number of data blocks d."""
         return len(self.offsets) - 1
 
-    def blocks(self):
+    def blocks(self) -> Iterator[tuple[int, int]]:
         """Yield (start, stop) of every block."""
         return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
-    def confine(self, support):
+    def confine(self, support: np.ndarray) -> None:
         """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}."""
         self.confined_to = support
         self.lowest[~support] = np.inf
         self.comm.settle()
 
-    def support_only(self, support, points=PointSources()):
+    def support_only(self, support: np.ndarray, points: PointSources = PointSources()) -> None:
         """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again.
 
         At `points`, which the support holds, it is free in its flux only.
@@ -188,7 +195,7 @@ class AdaptivePPD:
         self.points = points
         self.comm.settle()
 
-    def start_from(self, model):
+    def start_from(self, model: np.ndarray) -> None:
         """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay."""
         for image in (self.model, self.anchor, self.model_bar):
             image[...] = model  # ranks of one machine write the same
@@ -196,15 +203,15 @@ class AdaptivePPD:
         self.comm.settle()
         self.measurement.forward(self.model, self._phi_anchor)
 
-    def constrain(self, l2_bounds):
+    def constrain(self, l2_bounds: np.ndarray) -> None:
         """From now on, keep every block within its bound ε_j, float (d,): Step 5 finds the multipliers."""
         self.l2_bounds, self.constrained = l2_bounds, True
 
-    def penalise(self, multipliers):
+    def penalise(self, multipliers: np.ndarray) -> None:
         """From now on, give every block the multiplier λ_j, float (d,); its bound is what follows from it."""
         self.multipliers[:], self.constrained = multipliers, False
 
-    def step(self):
+    def step(self) -> None:
         """Do one iteration; Steps 7–10, the bounds, are taken after it."""
         summed_norms_sq = self._update_data_dual()  # Steps 5–6
         self._update_prior_dual()  # Step 13
@@ -213,7 +220,7 @@ class AdaptivePPD:
         self.iteration += 1
 
     def _update_data_dual(self):
-        """Steps 5–6: v from Φx̄, its gradient Φ†v, and μ_j²; return a function that waits for its sum over the ranks."""
+        """Steps 5–6: v from Φx̄, its gradient Φ†v, and μ_j²; return what waits for its sum over the ranks."""
         self.measurement.forward(self.model_bar, self._phi_bar)
         if self.constrained:
             self._update_multipliers()
@@ -230,8 +237,8 @@ class AdaptivePPD:
         """P_{E_j} of Step 5: the λ_j for which ‖q_j − y_j‖ = ε_j, from those of the iteration before."""
         for j, (start, stop) in enumerate(self.blocks()):
             self.multipliers[j] = ellipsoid_multiplier(
-                self.l2_dual, self._phi_bar, self.vis, self.precond, self.l2_bounds[j], self.multipliers[j], start, stop,
-                comm=self.comm)
+                self.l2_dual, self._phi_bar, self.vis, self.precond, self.l2_bounds[j], self.multipliers[j],
+                start, stop, comm=self.comm)
 
     def _update_prior_dual(self):
         """Step 13: u from Ψ†x̄, and its gradient Ψu."""
@@ -276,11 +283,11 @@ class AdaptivePPD:
             run(kernels.add_scaled, other, first, real(1), part=self.comm.part)
         return (first, last), (steps[0], real(1), steps[2])
 
-    def adjoint(self, vis, out=None):
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Return Φ†·vis of the samples of all ranks."""
         return self.comm.sum(self.measurement.adjoint(vis, out))
 
-    def rescale(self, threshold):
+    def rescale(self, threshold: float) -> None:
         """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.
 
         The saddle point of (κ, λ, u, v) and that of the same times a factor have the same image x.
@@ -292,7 +299,7 @@ class AdaptivePPD:
             self.multipliers *= factor
         self.threshold = float(threshold)
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return all that the next step depends on, beside the constructor's arguments.
 
         Returns
@@ -304,7 +311,7 @@ class AdaptivePPD:
         values = {name: getattr(self, name) for name in STATE_VALUES}
         return arrays | values | dict(l2_bounds=self.l2_bounds, points=self.points.places)
 
-    def set_state(self, state):
+    def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned, by copies."""
         for name in STATE_ARRAYS:
             fill(getattr(self, name), state[name])

@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import struct
+from typing import Any
 
 import numpy as np
 
@@ -29,7 +30,7 @@ class CheckpointError(ValueError):
     """The checkpoint is not one that this run can go on from; the message says why."""
 
 
-def fill(array, values):
+def fill(array: np.ndarray, values: np.ndarray) -> None:
     """Copy `values` into `array` of the same shape and type.
 
     Raises
@@ -42,7 +43,7 @@ def fill(array, values):
     array[...] = values
 
 
-def write(path, header, state):
+def write(path: str, header: dict[str, Any], state: dict[str, Any]) -> None:
     """Write a checkpoint, which takes its place when it is complete and on the disk.
 
     Parameters
@@ -58,7 +59,7 @@ def write(path, header, state):
     OSError
         It cannot be written; what was there is still there.
     """
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     tree = _split(state, arrays)
     listed = [dict(name=name, dtype=array.dtype.str, shape=array.shape, sha256=digest(array))
               for name, array in arrays.items()]
@@ -83,7 +84,7 @@ def write(path, header, state):
         os.close(folder)
 
 
-def read(path):
+def read(path: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a checkpoint and check every bit of it.
 
     Returns
@@ -155,6 +156,6 @@ def _bytes(array):
     return array.reshape(-1).view(np.uint8)
 
 
-def digest(array):
+def digest(array: np.ndarray) -> str:
     """Return the SHA-256 of a C-contiguous array, as text."""
     return hashlib.sha256(_bytes(array)).hexdigest()
