@@ -267,7 +267,19 @@ def _look_back(images, plane, solution, comm):
 
 
 def split(data, blocks, comm=SERIAL):
-    """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`)."""
+    """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`).
+
+    Parameters
+    ----------
+    data : Visibilities
+    blocks : int or tuple of str
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    Split
+    """
     block_of_sample, infos = divide(data, blocks, comm)
     data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
     noise = noise_from_differences(data, offsets, comm)
@@ -275,7 +287,26 @@ def split(data, blocks, comm=SERIAL):
 
 
 def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
-    """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of."""
+    """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of.
+
+    Parameters
+    ----------
+    data : Visibilities
+    model : real (nx, ny)
+        Jy/pixel.
+    grid : ImageGrid
+    weighting : Weighting
+    options : SolverOptions
+        Whose number of threads is used.
+    plane : ImagePlane
+        For the beam.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    PlaneImages
+    """
     weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the hands, too

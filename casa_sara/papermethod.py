@@ -61,7 +61,18 @@ def block_norms(problem: Problem, problem_of: Callable[..., Problem], options: S
 
 
 def paper_prior(dictionary: SaraDictionary, measurement: Measurement) -> PaperPrior:
-    """The prior of the paper on a dictionary."""
+    """The prior of the paper on a dictionary.
+
+    Parameters
+    ----------
+    dictionary : SaraDictionary
+    measurement : Measurement
+        Whose threads are used.
+
+    Returns
+    -------
+    PaperPrior
+    """
     return PaperPrior(dictionary, measurement.workers, power_method)
 
 
@@ -113,5 +124,16 @@ def paper_bounds(ppd: AdaptivePPD, nnls_norms: np.ndarray, weights: np.ndarray,
 
 
 def first_threshold(options: SolverOptions, first: np.ndarray) -> float:
-    """κ in the unit of an image: a fraction of the brightest pixel of the first, (nx, ny)."""
+    """κ in the unit of an image: a fraction of the brightest pixel of the first, (nx, ny).
+
+    Parameters
+    ----------
+    options : SolverOptions
+    first : real (nx, ny)
+        The image of the search for wild samples.
+
+    Returns
+    -------
+    float
+    """
     return PaperSchedule.of(options).kappa * (float(np.abs(first).max()) or 1.0)

@@ -54,7 +54,16 @@ class Samples:
             self.kept = np.arange(self.data.size)
 
     def without(self, index: np.ndarray) -> Samples:
-        """Leave out samples, numbered as they are here."""
+        """Leave out samples, numbered as they are here.
+
+        Parameters
+        ----------
+        index : int (n,)
+
+        Returns
+        -------
+        Samples
+        """
         if len(index) == 0:
             return self
         good = np.delete(np.arange(self.data.size), index)
@@ -98,6 +107,25 @@ class Problem:
         """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`.
 
         Its norm is measured unless given.
+
+        Parameters
+        ----------
+        samples : Samples
+        grid : ImageGrid
+        options : SolverOptions
+        unit_jy : float
+            Jy/pixel in the unit of the image.
+        eps : float
+            Accuracy of the operator.
+        data_norm_sq : float, optional
+            ‖U^½Φ‖².
+        support : bool (nx, ny), optional
+        comm : casa_sara.parallel.Serial or MPI
+            Over whose ranks the samples are spread.
+
+        Returns
+        -------
+        Problem
         """
         data = samples.data
         sqrt_weight = np.sqrt(data.weight)

@@ -264,7 +264,14 @@ def _resume(samples, layout, problem_of, options, checkpoint, crew):
 
 
 def check_l2bound(options: SolverOptions, blocks: int) -> None:
-    """Raise ValueError where the noise levels given are not one for all blocks, or one for each."""
+    """Raise ValueError where the noise levels given are not one for all blocks, or one for each.
+
+    Parameters
+    ----------
+    options : SolverOptions
+    blocks : int
+        d.
+    """
     if options.databound == "fixed" and len(options.l2bound) not in (1, blocks):
         raise ValueError(f"l2bound = {list(options.l2bound)}: there are {blocks} blocks; give one noise level "
                          "for all of them, or one for each")
@@ -281,7 +288,22 @@ def _plain_state(state, comm):
 
 def operator_accuracy(data: Visibilities, offsets: np.ndarray, noise: np.ndarray | None,
                       comm: Serial = SERIAL) -> float:
-    """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown."""
+    """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown.
+
+    Parameters
+    ----------
+    data : Visibilities
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    noise : float (d,) or None
+        Noise of each block relative to the MS weights.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    float
+    """
     if noise is None or not np.all(np.asarray(noise) > 0):
         return SMALLEST_EPS[np.dtype(np.float32)]
     level = np.repeat(np.asarray(noise, np.float32), np.diff(offsets))
@@ -289,7 +311,16 @@ def operator_accuracy(data: Visibilities, offsets: np.ndarray, noise: np.ndarray
 
 
 def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
-    """The solver's schedule for these task parameters."""
+    """The solver's schedule for these task parameters.
+
+    Parameters
+    ----------
+    options : SolverOptions
+
+    Returns
+    -------
+    Schedule or PaperSchedule
+    """
     if options.method == PAPER:
         return PaperSchedule.of(options)
     return Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,

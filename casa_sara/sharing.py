@@ -151,6 +151,22 @@ def series_with(data, residual, suspect, comm):
 
     A series is what one baseline and channel have seen.  One rank alone has them all; of several each is given those of
     its own suspects, and of the others'.
+
+    Parameters
+    ----------
+    data : Visibilities
+    residual : complex (M,)
+    suspect : int (n,)
+        Numbers of samples.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    data : Visibilities
+    residual : complex (M',)
+    suspect : int (n,)
+        The same samples among those.
     """
     if comm.size == 1:
         return data, residual, suspect

@@ -137,7 +137,23 @@ def _tell_end(reconstruction, checkpoint):
 
 def without_wild(data: Visibilities, blocks: list[BlockInfo], offsets: np.ndarray, reconstruction: Reconstruction,
                  comm: Serial = SERIAL) -> tuple[Visibilities, list[BlockInfo]]:
-    """Leave out what the reconstruction left out, and say what that was."""
+    """Leave out what the reconstruction left out, and say what that was.
+
+    Parameters
+    ----------
+    data : Visibilities
+    blocks : list of d BlockInfo
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    reconstruction : Reconstruction
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    data : Visibilities
+    blocks : list of d BlockInfo
+    """
     wild = reconstruction.wild
     if not wild:
         return data, blocks

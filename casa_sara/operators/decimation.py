@@ -66,11 +66,31 @@ class AxisDecimation:
         self.count = (size - 1 - size // 2 + half) // self.factor - self.start + 1
 
     def response(self, frequency: np.ndarray) -> np.ndarray:
-        """ĥ(frequency − centre)/D, the factor on the spectrum."""
+        """ĥ(frequency − centre)/D, the factor on the spectrum.
+
+        Parameters
+        ----------
+        frequency : real, any shape
+            Cycles per pixel.
+
+        Returns
+        -------
+        float64, of the shape of frequency
+        """
         return _spectrum(self._lowpass, np.asarray(frequency) - self.centre) / self.factor
 
     def modulation(self, samples: np.ndarray) -> np.ndarray:
-        """exp(2πi·centre·D·i) at the given samples i, which moves the band's centre to frequency 0."""
+        """exp(2πi·centre·D·i) at the given samples i, which moves the band's centre to frequency 0.
+
+        Parameters
+        ----------
+        samples : int (n,)
+            Numbers i.
+
+        Returns
+        -------
+        complex128 (n,)
+        """
         return np.exp(2j * np.pi * self.centre * self.factor * samples)
 
 
@@ -125,7 +145,23 @@ class Separable(NamedTuple):
 
 def separable(axis: AxisDecimation, size: int, cells: np.ndarray, factors: np.ndarray,
               dtype: npt.DTypeLike) -> Separable:
-    """`axis`, of `size` pixels, with its samples' cells and further factors, for arithmetic in complex `dtype`."""
+    """`axis`, of `size` pixels, with its samples' cells and further factors, for arithmetic in complex `dtype`.
+
+    Parameters
+    ----------
+    axis : AxisDecimation
+    size : int
+        Pixels.
+    cells : int64 (count,)
+        Where each sample goes in the grid.
+    factors : float64 (count,)
+        What each is multiplied with, beside the modulation.
+    dtype : complex64 or complex128
+
+    Returns
+    -------
+    Separable
+    """
     margin = (GROUP - 1) * axis.factor
     first = axis.factor * axis.start - axis.taps.size // 2 + size // 2
     gains = factors * axis.modulation(axis.start + np.arange(axis.count))

@@ -139,13 +139,35 @@ class SaraDictionary:
         return found
 
     def analysis(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Ψ† image, an array of `coef_shape`, in `out` where given."""
+        """Return Ψ† image, an array of `coef_shape`, in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : real coef_shape, optional
+            Receives the result.
+
+        Returns
+        -------
+        real coef_shape
+        """
         out = self.allocate() if out is None else self._checked(out, "out", self.coef_shape)
         self._analyse(image, self._job(out, kernels.KEEP))
         return out
 
     def synthesis(self, coefs: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the image Ψ coefs, in `out` where given."""
+        """Return the image Ψ coefs, in `out` where given.
+
+        Parameters
+        ----------
+        coefs : real coef_shape
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
         job = self._job(coefs, kernels.KEEP)
@@ -203,6 +225,18 @@ class SaraDictionary:
 
         d̄ is the root mean square of a coefficient and its eight neighbours in the band (periodic).  `alpha` > 0 and
         `scale` s are one number per band, in the order of `bands`, or one for all.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        alpha, scale : float or float (number of bands,)
+            α > 0, in the unit of the coefficients, and s.
+        out : real coef_shape
+            Receives the weights.
+
+        Returns
+        -------
+        real coef_shape
         """
         out = self.analysis(image, self._checked(out, "out", self.coef_shape))
         params = np.empty((len(self._rectangles), 2), self.dtype)
@@ -213,7 +247,15 @@ class SaraDictionary:
         return out
 
     def scale_at(self, coefs: np.ndarray, pixels: np.ndarray, factor: float) -> None:
-        """Multiply the coefficients that describe some pixels, bool (nx, ny), and those beside them, in place."""
+        """Multiply the coefficients that describe some pixels, bool (nx, ny), and those beside them, in place.
+
+        Parameters
+        ----------
+        coefs : real coef_shape
+            Changed in place.
+        pixels : bool (nx, ny)
+        factor : float
+        """
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         plane = np.zeros(self.coef_shape[1:], bool)
         plane[:self.shape[0], :self.shape[1]] = pixels
@@ -270,7 +312,19 @@ def _approximations(padded, levels, itemsize):
 
 def coefficient_bytes(shape: tuple[int, int], n_bases: int, levels: int,
                       dtype: npt.DTypeLike = np.float32) -> tuple[int, int]:
-    """Memory of one array of coefficients, and of the workspace of a dictionary, in bytes."""
+    """Memory of one array of coefficients, and of the workspace of a dictionary, in bytes.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Pixels of the image.
+    n_bases, levels : int
+    dtype : float32 or float64
+
+    Returns
+    -------
+    int, int
+    """
     padded, size = _padded(shape, levels), np.dtype(dtype).itemsize
     return n_bases * padded[0] * padded[1] * size, n_bases * _approximations(padded, levels, size) * size
 
@@ -311,7 +365,17 @@ def _filters(wavelets, n_bases, dtype):
 
 
 def filter_lengths(wavelets: Sequence[str]) -> np.ndarray:
-    """Return the number of taps of each basis, int (b,), 0 for Dirac."""
+    """Return the number of taps of each basis, int (b,), 0 for Dirac.
+
+    Parameters
+    ----------
+    wavelets : sequence of str
+        Names of the bases, 'dirac' or those of PyWavelets.
+
+    Returns
+    -------
+    int64 (b,)
+    """
     return np.array([0 if name == "dirac" else pywt.Wavelet(name).dec_len for name in wavelets], np.int64)
 
 

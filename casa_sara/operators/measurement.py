@@ -116,7 +116,18 @@ class MeasurementOperator:
         self._scratch = np.zeros(scratch_shape(self._columns, self.workers.count), self.dtype)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the visibilities Φ·image, complex (M,), of a real image (nx, ny), in `out` where given."""
+        """Return the visibilities Φ·image, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         image = _checked(np.ascontiguousarray(image, self.dtype), "image", self.shape, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         _checked(out, "out", (self.size,), self.complex_dtype)
@@ -129,6 +140,16 @@ class MeasurementOperator:
         """Return the real image Re(Φ†·vis), (nx, ny), of complex visibilities (M,), in `out` where given.
 
         It is the adjoint for real inner products: Re⟨Φx, y⟩ = ⟨x, adjoint(y)⟩.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
         """
         vis = _checked(np.ascontiguousarray(vis, self.complex_dtype), "vis", (self.size,), self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
@@ -147,11 +168,33 @@ class NoVisibilities:
         self.complex_dtype, self.workers = np.result_type(self.dtype, np.complex64), Workers(nthreads)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return no visibilities."""
+        """Return no visibilities.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         return np.empty(0, self.complex_dtype) if out is None else out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return zeros (nx, ny), in `out` where given."""
+        """Return zeros (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         out = np.empty(self.shape, self.dtype) if out is None else out
         out.fill(0)
         return out
@@ -166,13 +209,39 @@ class Summed:
         self.forward = measurement.forward
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the image of all visibilities, on every rank."""
+        """Return the image of all visibilities, on every rank.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            Of this rank.
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         return self._comm.sum(self._measurement.adjoint(vis, out))
 
 
 def share_of(uv: np.ndarray, *arguments: Any, comm: Serial = SERIAL,
              **options: Any) -> MeasurementOperator | NoVisibilities:
-    """Return the operator of this rank's visibilities; arguments and errors as of :class:`MeasurementOperator`."""
+    """Return the operator of this rank's visibilities; arguments and errors as of :class:`MeasurementOperator`.
+
+    Parameters
+    ----------
+    uv : float64 (2, M)
+        Baselines of this rank's visibilities in wavelengths; M may be 0.
+    *arguments, **options
+        As of :class:`MeasurementOperator`.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the visibilities are spread.
+
+    Returns
+    -------
+    MeasurementOperator or NoVisibilities
+    """
     if comm.size == 1:
         return MeasurementOperator(uv, *arguments, **options)
     reach = [comm.largest(float(np.abs(axis).max(initial=0))) for axis in uv]
@@ -183,7 +252,15 @@ def share_of(uv: np.ndarray, *arguments: Any, comm: Serial = SERIAL,
 
 
 def check_cell(uv: np.ndarray, cell_rad: float | tuple[float, float] | np.ndarray) -> None:
-    """Raise ValueError unless pixels of `cell_rad` (one number, or one per axis) sample the fringes of uv (2, M)."""
+    """Raise ValueError unless pixels of `cell_rad` (one number, or one per axis) sample the fringes of uv (2, M).
+
+    Parameters
+    ----------
+    uv : float64 (2, M)
+        Baselines in wavelengths.
+    cell_rad : float or (float, float)
+        Pixel size in radians.
+    """
     cell = np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))
     if not np.all(cell > 0):
         raise ValueError(f"cell={cell_rad} must be positive, in radians")
@@ -195,7 +272,17 @@ def check_cell(uv: np.ndarray, cell_rad: float | tuple[float, float] | np.ndarra
 
 
 def check_field(longest: float, shape: tuple[int, int], cell_rad: tuple[float, float]) -> None:
-    """Raise ValueError unless the image is as wide as the fringe of the longest baseline, in wavelengths."""
+    """Raise ValueError unless the image is as wide as the fringe of the longest baseline, in wavelengths.
+
+    Parameters
+    ----------
+    longest : float
+        Longest baseline in wavelengths.
+    shape : (int, int)
+        Pixels of the image.
+    cell_rad : (float, float)
+        Pixel size in radians.
+    """
     width = min(n * cell for n, cell in zip(shape, cell_rad))
     if width * longest < 1:
         cells = [f"{cell * ARCSEC_PER_RAD:.4g}arcsec" for cell in cell_rad]

@@ -56,7 +56,18 @@ class ModulatedOperator:
         self._vis = np.empty(self.size, self.complex_dtype)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
+        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         image = np.ascontiguousarray(image, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         if image.shape != self.shape or out.shape != (self.size,) or out.dtype != self.complex_dtype:
@@ -71,7 +82,18 @@ class ModulatedOperator:
         return out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
+        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,).
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         vis = np.ascontiguousarray(vis, self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
         if vis.shape != (self.size,) or out.shape != self.shape or out.dtype != self.dtype:
@@ -86,7 +108,21 @@ class ModulatedOperator:
 
 
 def terms_needed(largest: float, eps: float, modified: bool = False) -> int:
-    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`: the rest is below eps for |c| ≤ largest."""
+    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`: the rest is below eps for |c| ≤ largest.
+
+    Parameters
+    ----------
+    largest : float
+        Largest |c|.
+    eps : float
+        Largest rest of the series.
+    modified : bool
+        Of exp(c s) instead of exp(i c s).
+
+    Returns
+    -------
+    int
+    """
     rest = 2 * (iv if modified else jv)(np.arange(MOST), largest)
     rest = np.cumsum(np.abs(rest)[::-1])[::-1]  # of the orders from k on
     return max(1, int(np.count_nonzero(rest > eps)))

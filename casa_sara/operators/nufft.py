@@ -119,7 +119,13 @@ class NonUniformFFT:
         self._workers.run(_clear, self._cells)
 
     def to_points(self, out: np.ndarray) -> None:
-        """Transform the samples in `grid` into `out`, contiguous complex (M,)."""
+        """Transform the samples in `grid` into `out`, contiguous complex (M,).
+
+        Parameters
+        ----------
+        out : complex (M,)
+            Receives the values, in the order of the points as they were given.
+        """
         for part in self._filled:
             self._fft(part, 1, scipy.fft.ifft)
         used, halo, length = self.grid[:, self._used], self._halo, self._lengths[0]
@@ -129,7 +135,13 @@ class NonUniformFFT:
         self._workers.run(_interpolate, self._memory, self._stride, self._points, self._kernel, _real_pairs(out))
 
     def from_points(self, values: np.ndarray) -> None:
-        """Transpose of `to_points`, from `values`, contiguous complex (M,)."""
+        """Transpose of `to_points`, from `values`, contiguous complex (M,).
+
+        Parameters
+        ----------
+        values : complex (M,)
+            In the order of the points as they were given.
+        """
         self.clear()
         self._workers.run(_spread, self._memory, self._stride, self._points, self._kernel, self._pieces,
                           _real_pairs(values))
@@ -191,7 +203,22 @@ def _pieces(n_points):
 
 
 def memory_size(n_points: int, starts: Sequence[int], counts: Sequence[int], eps: float, dtype: npt.DTypeLike) -> int:
-    """Number of reals in the grid and the pieces, at most: these hold disjoint tiles of the rows, but for a halo each."""
+    """Number of reals in the grid and the pieces, at most: these hold disjoint tiles of the rows, but for a halo each.
+
+    Parameters
+    ----------
+    n_points : int
+        Number of points M.
+    starts, counts : (int, int)
+        First sample and number of samples along both axes.
+    eps : float
+        Accuracy.
+    dtype : float32 or float64
+
+    Returns
+    -------
+    int
+    """
     width, _, lengths = _least_work(n_points, starts, counts, eps, dtype)
     height = lengths[0] + 2 * (width // 2 + 1)
     more = _pieces(n_points) - 1

@@ -47,7 +47,23 @@ class WTerm:
 
     @classmethod
     def of(cls, max_w: float, shape: tuple[int, int], cell_rad: Sequence[float] | np.ndarray, eps: float) -> WTerm:
-        """The way that takes least for |w| ≤ max_w, in wavelengths, an image and an accuracy."""
+        """The way that takes least for |w| ≤ max_w, in wavelengths, an image and an accuracy.
+
+        Parameters
+        ----------
+        max_w : float
+            Largest |w| in wavelengths.
+        shape : (int, int)
+            Pixels of the image.
+        cell_rad : (float, float)
+            Pixel size in radians.
+        eps : float
+            Accuracy.
+
+        Returns
+        -------
+        WTerm
+        """
         depth = -float(_n_minus_1(*_cosines(shape, cell_rad, corners=True)).min())
         phase = 2 * np.pi * float(max_w) * depth
         terms = terms_needed(phase / 2, eps / 4)
@@ -147,7 +163,18 @@ class WGridder:
         self._vis = np.empty((self.size, 1), np.result_type(precise, np.complex64))
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
+        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         if np.shape(image) != self.shape:
             raise ValueError(f"image must be of shape {self.shape}")
         out = np.empty(self.size, self.complex_dtype) if out is None else out
@@ -158,7 +185,18 @@ class WGridder:
         return out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
+        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,).
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         if np.shape(vis) != (self.size,):
             raise ValueError(f"vis must be of shape ({self.size},)")
         out = np.empty(self.shape, self.dtype) if out is None else out

@@ -174,7 +174,12 @@ class AdaptivePPD:
         return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
     def confine(self, support: np.ndarray) -> None:
-        """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}."""
+        """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}.
+
+        Parameters
+        ----------
+        support : bool (nx, ny)
+        """
         self.confined_to = support
         self.lowest[~support] = np.inf
         self.comm.settle()
@@ -183,6 +188,11 @@ class AdaptivePPD:
         """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again.
 
         At `points`, which the support holds, it is free in its flux only.
+
+        Parameters
+        ----------
+        support : bool (nx, ny)
+        points : PointSources
         """
         if self.confined_to is not None:
             support = support & self.confined_to
@@ -196,7 +206,13 @@ class AdaptivePPD:
         self.comm.settle()
 
     def start_from(self, model: np.ndarray) -> None:
-        """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay."""
+        """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay.
+
+        Parameters
+        ----------
+        model : real (nx, ny)
+            In the unit of the iteration.
+        """
         for image in (self.model, self.anchor, self.model_bar):
             image[...] = model  # ranks of one machine write the same
             image[self.lowest == np.inf] = 0
@@ -204,11 +220,23 @@ class AdaptivePPD:
         self.measurement.forward(self.model, self._phi_anchor)
 
     def constrain(self, l2_bounds: np.ndarray) -> None:
-        """From now on, keep every block within its bound ε_j, float (d,): Step 5 finds the multipliers."""
+        """From now on, keep every block within its bound ε_j, float (d,): Step 5 finds the multipliers.
+
+        Parameters
+        ----------
+        l2_bounds : float (d,)
+            ε_j > 0, whitened.
+        """
         self.l2_bounds, self.constrained = l2_bounds, True
 
     def penalise(self, multipliers: np.ndarray) -> None:
-        """From now on, give every block the multiplier λ_j, float (d,); its bound is what follows from it."""
+        """From now on, give every block the multiplier λ_j, float (d,); its bound is what follows from it.
+
+        Parameters
+        ----------
+        multipliers : float (d,)
+            λ_j ≥ 0.
+        """
         self.multipliers[:], self.constrained = multipliers, False
 
     def step(self) -> None:
@@ -284,13 +312,30 @@ class AdaptivePPD:
         return (first, last), (steps[0], real(1), steps[2])
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Φ†·vis of the samples of all ranks."""
+        """Return Φ†·vis of the samples of all ranks.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            Whitened, of this rank.
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         return self.comm.sum(self.measurement.adjoint(vis, out))
 
     def rescale(self, threshold: float) -> None:
         """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.
 
         The saddle point of (κ, λ, u, v) and that of the same times a factor have the same image x.
+
+        Parameters
+        ----------
+        threshold : float
+            κ ≥ 0, in the unit of the model.
         """
         if self.threshold > 0:
             factor = threshold / self.threshold

@@ -112,6 +112,15 @@ class Checkpoint:
         """Write `make_state()` when it is time, or `now`.
 
         What a full disk, or the like, prevents is said in the log and tried again: the run matters more.
+
+        Parameters
+        ----------
+        make_state : callable
+            Returns the state: dict of dicts, plain values and C-contiguous arrays.
+        iteration : int
+            Of the state.
+        now : bool
+            Write whatever the time.
         """
         begun = time.monotonic()
         if not self.due(now):

@@ -67,7 +67,16 @@ class PaperSchedule:
 
     @classmethod
     def of(cls, options: SolverOptions) -> PaperSchedule:
-        """The paper's values, but for those that task parameters, set to other than their defaults, give."""
+        """The paper's values, but for those that task parameters, set to other than their defaults, give.
+
+        Parameters
+        ----------
+        options : SolverOptions
+
+        Returns
+        -------
+        PaperSchedule
+        """
         names = dict(boundrelchange="gamma_1", boundtol="gamma_2", boundstep="gamma_3", boundinterval="interval",
                      reweightdecay="omega", nreweights="reweightings", reweighttol="varrho", reltol="reltol",
                      finalreltol="final_reltol", niter="niter")
@@ -121,7 +130,18 @@ class PaperBounds:
         return float(np.sum(self.weight_sums * 2.0 * self.samples / self.l2_bounds**2))
 
     def adapt(self, ppd: AdaptivePPD, schedule: PaperSchedule) -> bool:
-        """Steps 7–10 at the end of iteration t; return whether any bound moved."""
+        """Steps 7–10 at the end of iteration t; return whether any bound moved.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            After its step; takes the bounds.
+        schedule : PaperSchedule
+
+        Returns
+        -------
+        bool
+        """
         settled, self._sigma = self._sigma < schedule.gamma_1, ppd.rel_change
         off = np.abs(ppd.residual_norms - self.l2_bounds) > schedule.gamma_2 * self.l2_bounds
         move = off & (ppd.iteration - self._moved >= schedule.interval) & (settled and self.adapts)
@@ -132,7 +152,17 @@ class PaperBounds:
         return bool(move.any())
 
     def met_by(self, ppd: AdaptivePPD, schedule: PaperSchedule) -> bool:
-        """Whether μ_j ≤ ε_j for all blocks, to within γ2."""
+        """Whether μ_j ≤ ε_j for all blocks, to within γ2.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+        schedule : PaperSchedule
+
+        Returns
+        -------
+        bool
+        """
         return bool(np.all(ppd.residual_norms <= (1 + schedule.gamma_2) * self.l2_bounds))
 
     def state(self) -> dict[str, Any]:

@@ -24,11 +24,33 @@ class Measurement(Protocol):
     workers: Any
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Φ·image, in `out` where given."""
+        """Return Φ·image, in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         ...
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Re(Φ†·vis), in `out` where given."""
+        """Return Re(Φ†·vis), in `out` where given.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         ...
 
 
@@ -48,7 +70,25 @@ class Prior(Protocol):
 
     def dual_step(self, model_bar: np.ndarray, dual: np.ndarray, threshold: float, weights: np.ndarray, out: np.ndarray,
                   relaxation: float) -> np.ndarray:
-        """Update `dual` in place from Ψ†·model_bar and return ζΨ·dual in `out`, real (nx, ny)."""
+        """Update `dual` in place from Ψ†·model_bar and return ζΨ·dual in `out`, real (nx, ny).
+
+        Parameters
+        ----------
+        model_bar : real (nx, ny)
+            x̄.
+        dual, weights : real, of the shape of coefficients
+            u and W.
+        threshold : float
+            κ.
+        out : real (nx, ny)
+            Receives the result.
+        relaxation : float
+            ρ.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         ...
 
 
@@ -56,9 +96,31 @@ class Dictionary(Prior, Protocol):
     """Ψ by itself, ‖Ψ‖ = 1."""
 
     def analysis(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Ψ†·image, in `out` where given."""
+        """Return Ψ†·image, in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : real, of the shape of coefficients, optional
+            Receives the result.
+
+        Returns
+        -------
+        real, of the shape of coefficients
+        """
         ...
 
     def synthesis(self, coefs: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Ψ·coefs, real (nx, ny), in `out` where given."""
+        """Return Ψ·coefs, real (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        coefs : real, of the shape of coefficients
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         ...

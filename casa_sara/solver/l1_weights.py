@@ -72,6 +72,15 @@ def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confin
 
     Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
     threshold at the noise of one pixel would let it through.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+        Its `l1_weights` are set.
+    bounds : GivenBounds or AdaptiveBounds
+        Whose noise levels are the noise.
+    confined : bool
+        A support confines the model.
     """
     noise, pixel = band_noise(ppd, bounds)
     for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel) * _shares(ppd, confined)):

@@ -115,7 +115,18 @@ class GivenBounds(_NoiseLevels):
         return False
 
     def met_by(self, ppd: AdaptivePPD, slack: float = 1.0) -> bool:
-        """Whether every block's residual is inside its bound, but for a relative 1e-3 × slack."""
+        """Whether every block's residual is inside its bound, but for a relative 1e-3 × slack.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+        slack : float
+            Factor on the tolerance.
+
+        Returns
+        -------
+        bool
+        """
         return not ppd.constrained or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3 * slack)))
 
 
@@ -151,7 +162,17 @@ class AdaptiveBounds(_NoiseLevels):
         """Nothing changes for the last problem."""
 
     def adapt(self, ppd: AdaptivePPD) -> bool:
-        """Steps 7–10; return whether any bound moved."""
+        """Steps 7–10; return whether any bound moved.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            After its step; takes the multipliers of the new bounds.
+
+        Returns
+        -------
+        bool
+        """
         if ppd.rel_change >= self.rel_change:
             return False
         move = (ppd.iteration - self._last_move >= self.min_interval) & self._off_target(ppd)
@@ -164,7 +185,18 @@ class AdaptiveBounds(_NoiseLevels):
         return True
 
     def met_by(self, ppd: AdaptivePPD, slack: float = 1.0) -> bool:
-        """Whether every block's residual agrees with its bound, to slack × γ2."""
+        """Whether every block's residual agrees with its bound, to slack × γ2.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+        slack : float
+            Factor on the tolerance γ2.
+
+        Returns
+        -------
+        bool
+        """
         return not np.any(self._off_target(ppd, slack))
 
     def _off_target(self, ppd, slack=1.0):

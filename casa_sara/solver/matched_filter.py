@@ -137,7 +137,16 @@ class MatchedFilter:
         return radius < (below[0] if below.size else max(response.shape))
 
     def spectrum(self, image: np.ndarray) -> np.ndarray:
-        """Return what :meth:`snr` takes for an image (nx, ny)."""
+        """Return what :meth:`snr` takes for an image (nx, ny).
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+
+        Returns
+        -------
+        complex, of the padded image
+        """
         padded = np.zeros(self._padded, np.float32)
         padded[:self.shape[0], :self.shape[1]] = image
         return fft.rfft2(padded, workers=self._workers, overwrite_x=True)
@@ -171,7 +180,19 @@ def _square(image, half):
 
 
 def gaussian(half: int, width: float) -> np.ndarray:
-    """A Gaussian of unit sum in a square of 2 half + 1 pixels; a pixel of 1 where the width is 0."""
+    """A Gaussian of unit sum in a square of 2 half + 1 pixels; a pixel of 1 where the width is 0.
+
+    Parameters
+    ----------
+    half : int
+        The image has 2·half + 1 pixels along each axis.
+    width : float
+        FWHM in pixels; 0 for a point.
+
+    Returns
+    -------
+    float64 (2·half + 1, 2·half + 1)
+    """
     if not width:
         return (distance((2 * half + 1,) * 2) == 0).astype(float)
     values = np.exp(-0.5 * (distance((2 * half + 1,) * 2) * SIGMA_TO_FWHM / width) ** 2)
@@ -179,7 +200,17 @@ def gaussian(half: int, width: float) -> np.ndarray:
 
 
 def distance(shape: tuple[int, int]) -> np.ndarray:
-    """Distance of each pixel from that in the middle."""
+    """Distance of each pixel from that in the middle.
+
+    Parameters
+    ----------
+    shape : (int, int)
+
+    Returns
+    -------
+    float64 (nx, ny)
+        Pixels.
+    """
     return np.hypot(*np.ogrid[tuple(slice(-(n // 2), n - n // 2) for n in shape)])
 
 

@@ -74,7 +74,15 @@ class SolverRecord:
         return STOP_DESCRIPTIONS.get(self.stop_code, "not finished")
 
     def note(self, ppd, reweighting: int) -> None:
-        """Add the state of the iteration `ppd`."""
+        """Add the state of the iteration `ppd`.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            After its step.
+        reweighting : int
+            Number of re-weightings before.
+        """
         self.iteration.append(ppd.iteration)
         self.reweighting.append(reweighting)
         self.rel_change.append(ppd.rel_change)

@@ -109,12 +109,32 @@ class SignificantSupport:
 
 
 def matched_filter(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> MatchedFilter:
-    """Return the :class:`MatchedFilter` of the data with the present noise levels."""
+    """Return the :class:`MatchedFilter` of the data with the present noise levels.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+
+    Returns
+    -------
+    MatchedFilter
+    """
     return MatchedFilter(point_response(ppd, bounds), ppd.measurement.workers.count)
 
 
 def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> np.ndarray:
-    """Return Φ†Σ⁻¹Φ of a pixel of 1 in the middle of the image, real (nx, ny)."""
+    """Return Φ†Σ⁻¹Φ of a pixel of 1 in the middle of the image, real (nx, ny).
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+
+    Returns
+    -------
+    real (nx, ny)
+    """
     vis, image = ppd.scratch_vis, ppd.scratch_image
     image.fill(0)
     image[tuple(n // 2 for n in image.shape)] = 1
@@ -124,7 +144,19 @@ def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> np
 
 
 def gradient_image(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, model: np.ndarray) -> np.ndarray:
-    """Return Φ†Σ⁻¹(y − Φx), real (nx, ny)."""
+    """Return Φ†Σ⁻¹(y − Φx), real (nx, ny).
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+    model : real (nx, ny)
+        x, in the unit of the iteration.
+
+    Returns
+    -------
+    real (nx, ny)
+    """
     vis = ppd.scratch_vis
     ppd.measurement.forward(model, vis)
     np.subtract(ppd.vis, vis, out=vis)

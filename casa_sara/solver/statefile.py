@@ -33,6 +33,12 @@ class CheckpointError(ValueError):
 def fill(array: np.ndarray, values: np.ndarray) -> None:
     """Copy `values` into `array` of the same shape and type.
 
+    Parameters
+    ----------
+    array : ndarray
+        Changed in place.
+    values : ndarray
+
     Raises
     ------
     ValueError
@@ -86,6 +92,10 @@ def write(path: str, header: dict[str, Any], state: dict[str, Any]) -> None:
 
 def read(path: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a checkpoint and check every bit of it.
+
+    Parameters
+    ----------
+    path : str
 
     Returns
     -------
@@ -157,5 +167,14 @@ def _bytes(array):
 
 
 def digest(array: np.ndarray) -> str:
-    """Return the SHA-256 of a C-contiguous array, as text."""
+    """Return the SHA-256 of a C-contiguous array, as text.
+
+    Parameters
+    ----------
+    array : ndarray, C-contiguous
+
+    Returns
+    -------
+    str
+    """
     return hashlib.sha256(_bytes(array)).hexdigest()
