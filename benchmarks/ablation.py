@@ -148,6 +148,7 @@ def solved(task: tuple[str, str, str], base: Path) -> dict:
     from casa_sara.casa.weights import dirty_image
     from casa_sara.operators.sky import sky_operator
     from casa_sara.options import SolverOptions
+    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
 
     rule, kind, name = task
@@ -156,7 +157,7 @@ def solved(task: tuple[str, str, str], base: Path) -> dict:
     with ExitStack() as replaced:
         for target, value in rules()[rule].items():
             replaced.enter_context(mock.patch(f"casa_sara.{target}", value))
-        found = reconstruct(data, seen["offsets"], seen["density"], grid, options, seen["noise"])
+        found = reconstruct(Samples(data, seen["offsets"], seen["density"], seen["noise"]), grid, options)
     result = dict(iterations=found.record.iteration[-1], stop=found.record.stop_description, wild=len(found.wild),
                   released=sum(one["released"] for one in found.record.reweightings), flux=float(found.model.sum()))
     if kind == "bright":

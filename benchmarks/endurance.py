@@ -69,7 +69,8 @@ def long_solution(vis, iterations):
     """
     from casa_sara.casa.ms import read_visibilities
     from casa_sara.options import ImageGrid, Selection, SolverOptions
-    from casa_sara.reconstruction import reconstruct
+    from casa_sara.problem import Samples
+    from casa_sara.reconstruction import Control, reconstruct
     from casa_sara.snapshots import snapshot_blocks
     from casa_sara.visibilities import sort_into_blocks
 
@@ -83,7 +84,7 @@ def long_solution(vis, iterations):
             memory.append(resident_memory())
             files.append(open_files())
 
-    record = reconstruct(data, offsets, np.ones(data.size), grid, options, progress=watch).record
+    record = reconstruct(Samples(data, offsets, np.ones(data.size)), grid, options, control=Control(watch)).record
     start = len(memory) // 10
     per_step = growth(memory[start:]) * 1000 / max(1, iterations // 200)
     return per_step, record.iteration[-1], files[-1] - files[start]

@@ -49,7 +49,7 @@ class PyWaveletsDictionary:
         self.step = PyWaveletsStep(shape, wavelets, nthreads, np.float64, THRESHOLD, RELAXATION)
 
     def allocate(self):
-        return None
+        return np.zeros(0)
 
     def dual_step(self, model_bar, dual, threshold, weights, out, relaxation):
         out[...] = self.step(model_bar)
@@ -76,9 +76,7 @@ def solver(measurement, dictionary, image, offsets):
     vis = np.zeros(offsets[-1], np.result_type(image.dtype, np.complex64))
     measurement.forward(image, vis)
     ppd = AdaptivePPD(measurement, dictionary, vis, offsets, np.full(vis.size, 0.5, image.dtype), float(offsets[-1]))
-    ppd.l1_weights, ppd.threshold, ppd.multipliers[:] = dictionary.allocate(), THRESHOLD, 0.1
-    if ppd.l1_weights is not None:
-        ppd.l1_weights.fill(1)
+    ppd.threshold, ppd.multipliers[:] = THRESHOLD, 0.1
     return ppd
 
 

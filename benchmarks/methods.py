@@ -61,6 +61,7 @@ def row(name, base, niter):
     """A line of the table for each method."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
+    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
 
     simulated = name in SCENES
@@ -71,7 +72,8 @@ def row(name, base, niter):
     lines = []
     for method in METHODS:
         begin = time.perf_counter()
-        found = reconstruct(part.data, part.offsets, density, grid, SolverOptions(method=method, niter=niter), part.noise)
+        samples = Samples(part.data, part.offsets, density, part.noise)
+        found = reconstruct(samples, grid, SolverOptions(method=method, niter=niter))
         seconds = time.perf_counter() - begin
         cells = [name, method]
         for factor in (0.5, 1.0):

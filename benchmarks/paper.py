@@ -203,7 +203,8 @@ def convergence(base, truth):
     from casa_sara.casa.weights import sampling_density
     from casa_sara.noise import noise_from_differences
     from casa_sara.options import ImageGrid, Selection, SolverOptions
-    from casa_sara.reconstruction import reconstruct
+    from casa_sara.problem import Samples
+    from casa_sara.reconstruction import Control, reconstruct
     from casa_sara.snapshots import snapshot_blocks
     from casa_sara.visibilities import sort_into_blocks
 
@@ -226,7 +227,7 @@ def convergence(base, truth):
             if ppd.iteration % 10 == 0:
                 curve.append((ppd.iteration, snr(true, smooth(ppd.model * ppd.unit_jy, 0.1 / cell))))
 
-        reconstruct(data, offsets, density, grid, SolverOptions(**changed), noise, progress=note)
+        reconstruct(Samples(data, offsets, density, noise), grid, SolverOptions(**changed), control=Control(note))
         curve = np.array(curve)
         reached[name] = curve
     convergence_picture(base / "convergence.png", reached)

@@ -58,7 +58,7 @@ def iteration(case, nthreads, repeat):
     vis = measurement.forward(image)
     ppd = AdaptivePPD(measurement, dictionary, vis, np.linspace(0, vis.size, blocks + 1).astype(int),
                       np.full(vis.size, 0.5, np.float32), float(census.samples), comm=comm)
-    ppd.l1_weights, ppd.threshold, ppd.multipliers[:] = dictionary.allocate(), 1e-3, 0.1
+    ppd.threshold, ppd.multipliers[:] = 1e-3, 0.1
     ppd.step()
     times, sums = [], []
     for _ in range(repeat):

@@ -108,6 +108,7 @@ def solved(scene: Scene, base: Path) -> dict:
     """Image a scene, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
+    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
 
     _, _, part, density, grid = observed(scene.samples_of, base)
@@ -123,7 +124,7 @@ def solved(scene: Scene, base: Path) -> dict:
     noise = np.sqrt(np.mean(np.abs(vis) ** 2) / 2) * 10 ** (-scene.noise_db / 20)
     vis += noise * (rng.standard_normal(vis.size) + 1j * rng.standard_normal(vis.size))
     data = replace(data, vis=vis.astype(np.complex64), weight=np.full(vis.size, noise**-2, np.float32))
-    found = reconstruct(data, offsets, density, grid, SolverOptions(nthreads=1), np.ones(len(offsets) - 1))
+    found = reconstruct(Samples(data, offsets, density, np.ones(len(offsets) - 1)), grid, SolverOptions(nthreads=1))
     beam = 2 * WIDTH * scene.samples_of.super_resolution
     quality = {name: snr(smoothed(sources, grid.shape, factor * beam), smooth(found.model, 2 * [factor * beam], 0.0))
                for name, factor in (("half", 0.5), ("one", 1.0))}

@@ -46,10 +46,11 @@ def solved(case: Case, base: Path) -> dict:
     """Image a case, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
+    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
 
     sky, simulated, part, density, grid = observed(case, base)
-    found = reconstruct(part.data, part.offsets, density, grid, SolverOptions(nthreads=1), part.noise)
+    found = reconstruct(Samples(part.data, part.offsets, density, part.noise), grid, SolverOptions(nthreads=1))
     ratio = found.l2_bounds / simulated["errors"]
     result = dict(iterations=found.record.iteration[-1], stop=found.record.stop_description, raw=snr(sky.truth(), found.model),
                   bounds=(float(ratio.min()), float(ratio.max())))

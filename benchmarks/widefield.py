@@ -47,7 +47,7 @@ def step(operator):
     vis, ones = np.ones(operator.size, np.complex64), np.ones(operator.size, np.float32)
     dictionary = SaraDictionary(operator.shape)
     ppd = AdaptivePPD(operator, dictionary, vis, [0, operator.size], ones, float(operator.size) * np.prod(operator.shape))
-    ppd.threshold, ppd.l1_weights = 1.0, dictionary.allocate()
+    ppd.threshold = 1.0
     return ppd.step
 
 

@@ -61,42 +61,25 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     ValueError, FileNotFoundError
         The products cannot be compared; the message names the task parameter.
     """
-    # read
     sets = _read(request, selection is None, 1 if single else 2)
     first, notes = sets[0].model, []
     if first.plane.frame not in RADESYS:
         raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or B1950")
     if RADESYS[first.plane.frame] == "FK4":
         notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
-    plane = first.plane.upright()
-    frames = read_frames(request.frames, plane)
-    observed = _Observed(selection, plane, request, sets, notes) if selection else None
+    frames = read_frames(request.frames, first.plane.upright())
     # one grid
-    if observed:
-        plane = observed.plane
-    elif any(one.model.plane.upright() is not one.model.plane for one in sets):
-        plane = _covered(plane, sets, notes)
+    observed = _Observed(selection, first.plane.upright(), request, sets, notes) if selection else None
+    plane = observed.plane if observed else _common_plane(sets, notes)
     models = {one.name: _on_grid(one.model, plane, first, "models", notes) for one in sets}
-    truth = None
-    if request.truth:
-        image = read_sky_image(request.truth, "truth", ("Jy/pixel",))
-        truth = _on_grid(image, plane, first, "truth", notes)
-    centre_deg = tuple(np.degrees(plane.centre).tolist())
-    cell_arcsec = tuple((np.array(plane.cell_rad) / ARCSEC).tolist())
-    frame = Frame(centre_deg, cell_arcsec, plane.shape, RADESYS[plane.frame])
+    truth = _truth(request, plane, first, notes)
+    frame = _frame(plane)
     regions = region_masks(request.regions, frame)
-    injected = places(request.inject, frame, "inject")
-    if injected and not (observed and any(can_be_repeated(one) for one in sets)):
-        raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; "
-                         "images of other imagers cannot be made again")
+    injected = _places_to_inject(request, frame, sets, observed)
     # one operator
     if observed:
-        beams = observed.beams
-        residuals, chi_square = {}, {}
         notes.extend(_other_data(sets, selection))
-        for one in sets:
-            left = observed.minus(one, models[one.name])
-            residuals[one.name], chi_square[one.name] = observed.images(left), observed.chi_square(left)
+        beams, residuals, chi_square = observed.measured(sets, models)
     else:
         check_same_data(sets)
         beams, residuals, chi_square = *_beside(sets, plane, notes), {}
@@ -106,11 +89,41 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
     if injected:
         _inject(injected, plane, request, selection, sets, beams, measures["products"])
-    versions = {"casa_sara": casa_sara.__version__} | {name: version(name) for name in VERSIONS}
     for note in notes:
         log.warn(note)
+    versions = {"casa_sara": casa_sara.__version__} | {name: version(name) for name in VERSIONS}
     return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures, versions,
                       tuple(notes), frames)
+
+
+def _common_plane(sets, notes):
+    """Return the grid of the first model, upright; if one is turned, without the edges that not all images reach."""
+    plane = sets[0].model.plane.upright()
+    turned = any(one.model.plane.upright() is not one.model.plane for one in sets)
+    return _covered(plane, sets, notes) if turned else plane
+
+
+def _truth(request, plane, first, notes):
+    """Return the true sky on the common grid, Jy/pixel, None where none is given."""
+    if not request.truth:
+        return None
+    return _on_grid(read_sky_image(request.truth, "truth", ("Jy/pixel",)), plane, first, "truth", notes)
+
+
+def _frame(plane):
+    """Return the coordinates of the common grid."""
+    centre_deg = tuple(np.degrees(plane.centre).tolist())
+    cell_arcsec = tuple((np.array(plane.cell_rad) / ARCSEC).tolist())
+    return Frame(centre_deg, cell_arcsec, plane.shape, RADESYS[plane.frame])
+
+
+def _places_to_inject(request, frame, sets, observed):
+    """Return the pixel coordinates of the point sources to inject, by name; raise where no run can be repeated."""
+    injected = places(request.inject, frame, "inject")
+    if injected and not (observed and any(can_be_repeated(one) for one in sets)):
+        raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; "
+                         "images of other imagers cannot be made again")
+    return injected
 
 
 def _read(request, with_residual, fewest):
@@ -287,6 +300,14 @@ class _Observed:
                       for weighting, weights in self._weights.items()}
         self._block_of_sample, blocks = snapshot_blocks(data)
         self._samples = np.array([block.samples for block in blocks])
+
+    def measured(self, sets, models):
+        """Return the beams, and by product the residual images and χ² of the blocks, of models on the common grid."""
+        residuals, chi_square = {}, {}
+        for one in sets:
+            left = self.minus(one, models[one.name])
+            residuals[one.name], chi_square[one.name] = self.images(left), self.chi_square(left)
+        return self.beams, residuals, chi_square
 
     def images(self, left):
         """Return the residual images by weighting, in Jy/beam, of residual visibilities."""

@@ -19,10 +19,11 @@ from casa_sara.deadline import Deadline
 from casa_sara.imaging import Result, describe, image_limits, nowhere_visible, plane_images, split
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.problem import Samples
 from casa_sara.reconstruction import check_l2bound, schedule_of
 from casa_sara.rehearsal import foresee
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, UNFINISHED
-from casa_sara.solving import Watch, checkpoint_of, list_islands, solve_image, without_wild
+from casa_sara.solving import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import Visibilities
 
@@ -206,9 +207,10 @@ class _Cube:
         """Return the solution of a channel."""
         log.info(f"reconstructing channel {k} (of {self.axis.size} channels)")
         part, request = self._split(k), self.request
-        watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations))
-        return solve_image(part.data, part.offsets, part.noise, None, request.grid, request.options,
-                           self._startmodel(k), checkpoint, watch)
+        density = density_of(part.data, None, request.grid, request.options)
+        samples = Samples(part.data, part.offsets, density, part.noise)
+        watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations), checkpoint)
+        return solve_image(samples, request.grid, request.options, self._startmodel(k), watch)
 
     def take(self, k, reconstruction):
         """Make the images of a channel from its solution."""

@@ -91,36 +91,58 @@ class Workload:
                             "process that writes": self._planes((PLANE + CUBES + 1) * self.channels)}}
 
     def _of_plane(self):
-        data = {"libraries": LIBRARIES, "visibilities": (SAMPLE + FREQUENCY * self.frequencies) * self.samples}
+        """The phases of one plane, in their order."""
+        data = self._data()
+        held = data | {"image planes": self._planes(PLANE)}
+        with_operator = held | {"operator": self._operator(self.band)}
         phases = {"reading": data | {"while reading": READING * self.samples}}
-        data["image planes"] = self._planes(PLANE)
-        plain, further = POINT * self.samples + self._grid(), further_bytes(self.samples, self, self.max_w, self.band)
-        operator = data | {"operator": plain + further}
-        solver = operator | {"solver's visibilities": SOLVER * self.samples}
         if self.niter > 0:
-            if self.precondition:
-                cells = DENSITY_CELL * self._side() ** 2
-                phases["density of samples"] = data | {"uv grid": WEIGHING * self.samples + cells}
-            phases["building the operator"] = operator | {"while planning": PLANNING * self.samples}
-            phases["NNLS"] = solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
-            coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
-            phases["iterating"] = solver | {
-                "image planes": self._planes(PLANE + SOLVING + MATCHED * self.confined), "re-weighting": PASSING * self.samples,
-                "wavelet duals and weights": self.duals * coefs, "wavelet workspace": workspace}
-            if any(self.whole):
-                phases["writing a checkpoint"] = phases["iterating"] | {
-                    "gathered of all ranks": 2 * (CHECKPOINT * self.whole[0]
-                                                  + 2 * coefficient_bytes(self.shape, self.whole[1], self.levels)[0])}
-        phases["writing"] = operator | {"while planning": PLANNING * self.samples,
-                                        "image planes": self._planes(PLANE + WRITING)}
-        if self.frequencies:
-            phases["writing"]["operator of flat spectra"] = plain + further_bytes(self.samples, self, self.max_w)
+            phases |= self._solving(held, with_operator)
+        phases["writing"] = self._writing(with_operator)
         if self.report:
-            operator = replace(self, samples=max(self.samples, self.whole[0]), report=False).memory()["writing"]
-            del operator["while planning"]
-            phases["report"] = operator | {"drawing": REPORT + REPORT_SAMPLE * max(self.samples, self.whole[0]),
-                                           "image planes": self._planes(REPORT_PLANES)}
+            phases["report"] = self._reporting()
         return phases
+
+    def _data(self):
+        return {"libraries": LIBRARIES, "visibilities": (SAMPLE + FREQUENCY * self.frequencies) * self.samples}
+
+    def _solving(self, held, with_operator):
+        """The phases from the density of the samples to the writing of a checkpoint."""
+        coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
+        with_solver = with_operator | {"solver's visibilities": SOLVER * self.samples}
+        iterating = with_solver | {
+            "image planes": self._planes(PLANE + SOLVING + MATCHED * self.confined),
+            "re-weighting": PASSING * self.samples, "wavelet duals and weights": self.duals * coefs,
+            "wavelet workspace": workspace}
+        phases = {}
+        if self.precondition:
+            cells = DENSITY_CELL * self._side() ** 2
+            phases["density of samples"] = held | {"uv grid": WEIGHING * self.samples + cells}
+        phases["building the operator"] = with_operator | {"while planning": PLANNING * self.samples}
+        phases["NNLS"] = with_solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
+        phases["iterating"] = iterating
+        if any(self.whole):
+            samples, bases = self.whole
+            duals_and_weights = 2 * coefficient_bytes(self.shape, bases, self.levels)[0]
+            phases["writing a checkpoint"] = iterating | {
+                "gathered of all ranks": 2 * (CHECKPOINT * samples + duals_and_weights)}
+        return phases
+
+    def _writing(self, with_operator):
+        parts = with_operator | {"while planning": PLANNING * self.samples,
+                                 "image planes": self._planes(PLANE + WRITING)}
+        return parts | {"operator of flat spectra": self._operator()} if self.frequencies else parts
+
+    def _reporting(self):
+        """The report has the operator of all ranks' samples, and draws them."""
+        samples = max(self.samples, self.whole[0])
+        parts = replace(self, samples=samples, report=False).memory()["writing"]
+        del parts["while planning"]
+        return parts | {"drawing": REPORT + REPORT_SAMPLE * samples, "image planes": self._planes(REPORT_PLANES)}
+
+    def _operator(self, band=0.0):
+        """Bytes of the measurement operator; `band` of an image of spectral indices, 0 for flat spectra."""
+        return POINT * self.samples + self._grid() + further_bytes(self.samples, self, self.max_w, band)
 
     def _planes(self, count):
         return int(4 * (count + SUPPORT * self.masked) * math.prod(self.shape))

@@ -11,7 +11,7 @@ import numpy as np
 from casa_sara.casa import log
 from casa_sara.casa.blockwords import divide
 from casa_sara.casa.child import waiting_child
-from casa_sara.casa.imageplane import define_image_plane, read_pixels
+from casa_sara.casa.imageplane import ImagePlane, define_image_plane, read_pixels
 from casa_sara.casa.images import read_model
 from casa_sara.casa.modelcolumn import save_model_column, write_model_column
 from casa_sara.casa.ms import read_visibilities
@@ -29,10 +29,12 @@ from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Spectrum, Weighting
 from casa_sara.parallel import SERIAL
+from casa_sara.problem import Samples
 from casa_sara.reconstruction import Reconstruction, operator_accuracy, schedule_of
 from casa_sara.rehearsal import foresee
+from casa_sara.sharing import Crew
 from casa_sara.solver.record import UNFINISHED
-from casa_sara.solving import Watch, checkpoint_of, list_islands, solve_image, without_wild
+from casa_sara.solving import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import BlockInfo, Visibilities, sort_into_blocks
 from casa_sara.warmup import kernels_loading
@@ -131,79 +133,153 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     checkpoint = checkpoint_of(selection, grid, options, output)
     if output.resume:
         comm.once(checkpoint.open)
+    request = _Request(selection, grid, weighting, options, output, limits, crew)
     with waiting_child() if comm.rank == 0 else nullcontext() as child, kernels_loading():  # both while CASA reads
-        # read
-        data, plane, grid = _read(selection, grid, output, crew)
-        start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
+        data, plane = _read(request)
         if output.images_stand:
-            comm.once(_save_model, selection, data, grid, options, start)
-            return Result(data, comm.total(data.size), [], np.zeros(0), None, comm.once(_peak, output.imagename + ".residual"),
-                          float(start.sum(dtype=float)), forecast.summary())
-        support = comm.once(read_support, grid, plane)
-        if support is not None and start is not None:
-            start *= support
-        # split and weigh
+            return _complete(request, plane, data, forecast)
         part = split(data, output.blocks, comm)
-        data, blocks, offsets, noise = part.data, part.blocks, part.offsets, part.noise
-        describe(data, blocks, noise, grid.stokes, comm)
-        if grid.gridder == "wproject":
-            accuracy = operator_accuracy(data, offsets, noise, comm)
-            log.info(WTerm.of(comm.largest(data.max_w), grid.shape, grid.cell_rad, accuracy).words)
-        _point_spread(data, grid, weighting, options, plane, comm)  # errors of weights and beam are raised before the solver
-        # solve
-        reconstruction, model = None, start if start is not None else np.zeros(grid.shape, np.float32)
-        if options.niter > 0:
-            deadline.reserve = _after_iterations(comm.total(data.size), grid, output, limits, deadline.elapsed())
-            watch = Watch(deadline, Pace(schedule_of(options).expected_iterations))
-            reconstruction = solve_image(data, offsets, noise, selection, grid, options, start, checkpoint, watch, support,
-                                         crew)
-            forecast = replace(forecast, iteration_s=watch.pace.seconds)
-            model = reconstruction.model
-            list_islands(reconstruction.record, plane, grid.cell_rad, options.significance, comm)
-            data, blocks = without_wild(data, blocks, offsets, reconstruction, comm)
-            offsets = np.searchsorted(reconstruction.kept, offsets)
-        # write
-        images = plane_images(data, model, grid, weighting, options, plane, comm)
-        doubtful = _look_back(images, support, reconstruction, Split(data, blocks, offsets, noise), grid, comm)
-        result = Result(data, comm.total(data.size), blocks, noise, reconstruction, images.residual_peak, images.model_flux,
-                        forecast.summary(), doubtful)
-        comm.once(write_products, output, plane, images.pixels, images.sumwt, images.beam, record and record(result), child)
+        del data  # the same samples, not yet sorted
+        _check(request, plane, part)
+        watch = Watch(deadline, Pace(schedule_of(options).expected_iterations), checkpoint)
+        solution = _solve(request, plane, part, watch)
+        images = plane_images(solution.part.data, solution.model, plane.grid, weighting, options, plane.image_plane,
+                              comm)
+        doubtful = _look_back(images, plane, solution, comm)
+        result = solution.result(images, doubtful, replace(forecast, iteration_s=watch.pace.seconds), comm)
+        comm.once(write_products, output, plane.image_plane, images.pixels, images.sumwt, images.beam,
+                  record and record(result), child)
     if comm.broadcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
-        comm.once(_save_model, selection, data, grid, options, model)
+        comm.once(_save_model, selection, solution.part.data, plane.grid, options, solution.model)
     return result
 
 
-def _read(selection, grid, output, crew):
-    """Return this rank's visibilities, the image plane, and the grid with its spectrum."""
-    comm = crew.comm
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), crew)
+@dataclass(frozen=True)
+class _Request:
+    """What the task was asked for, and the ranks that work on it."""
+
+    selection: Selection
+    grid: ImageGrid
+    weighting: Weighting
+    options: SolverOptions
+    output: Output
+    limits: Limits
+    crew: Crew
+
+
+@dataclass(frozen=True)
+class _Plane:
+    """The plane of the image: `grid` is what was asked for, with the spectrum that belongs to the plane.
+
+    `startmodel` real (nx, ny) in Jy/pixel and `support` bool (nx, ny) are None where there is none.
+    """
+
+    image_plane: ImagePlane
+    grid: ImageGrid
+    startmodel: np.ndarray | None
+    support: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """A model and the samples that it was made of; without `reconstruction` it is the one to start from."""
+
+    model: np.ndarray
+    part: Split
+    reconstruction: Reconstruction | None = None
+
+    def result(self, images, doubtful, forecast, comm):
+        """Return what the task tells of it."""
+        data, blocks = self.part.data, self.part.blocks
+        return Result(data, comm.total(data.size), blocks, self.part.noise, self.reconstruction, images.residual_peak,
+                      images.model_flux, forecast.summary(), doubtful)
+
+
+def _read(request):
+    """Return this rank's visibilities, and the plane of the image with its first model and support."""
+    grid, output, comm = request.grid, request.output, request.crew.comm
+    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), request.crew)
     data.notes.extend(image_limits(data, grid, comm))
-    plane = comm.once(define_image_plane, data, selection, grid, output.pblimit)
+    plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
     _caution(data)
-    return data, plane, comm.once(with_spectrum, grid, plane)
+    grid = comm.once(with_spectrum, grid, plane)
+    start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
+    if output.images_stand:
+        return data, _Plane(plane, grid, start)
+    support = comm.once(read_support, grid, plane)
+    if support is not None and start is not None:
+        start *= support
+    return data, _Plane(plane, grid, start, support)
 
 
-def _look_back(images, support, reconstruction, part, grid, comm):
+def _complete(request, plane, data, forecast):
+    """Write the model column that a finished run has not written any more; its images stand."""
+    comm, model = request.crew.comm, plane.startmodel
+    comm.once(_save_model, request.selection, data, plane.grid, request.options, model)
+    peak = comm.once(_peak, request.output.imagename + ".residual")
+    return Result(data, comm.total(data.size), [], np.zeros(0), None, peak, float(model.sum(dtype=float)),
+                  forecast.summary())
+
+
+def _check(request, plane, part):
+    """Describe in the log what was read; errors of weights and beam are raised here, before the solver."""
+    data, grid, comm = part.data, plane.grid, request.crew.comm
+    describe(data, part.blocks, part.noise, grid.stokes, comm)
+    if grid.gridder == "wproject":
+        accuracy = operator_accuracy(data, part.offsets, part.noise, comm)
+        log.info(WTerm.of(comm.largest(data.max_w), grid.shape, grid.cell_rad, accuracy).words)
+    _point_spread(data, grid, request.weighting, request.options, plane.image_plane, comm)
+
+
+def _solve(request, plane, part, watch):
+    """Find the model, within the time that writing leaves, and leave out the samples that it left out."""
+    options, grid, crew = request.options, plane.grid, request.crew
+    comm, data = crew.comm, part.data
+    if options.niter == 0:
+        return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
+    watch.deadline.reserve = _after_iterations(comm.total(data.size), grid, request.output, request.limits,
+                                               watch.deadline.elapsed())
+    samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise)
+    found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, crew)
+    list_islands(found.record, plane.image_plane, grid.cell_rad, options.significance, comm)
+    used, blocks = without_wild(data, part.blocks, part.offsets, found, comm)
+    return _Solution(found.model, Split(used, blocks, np.searchsorted(found.kept, part.offsets), part.noise), found)
+
+
+def _look_back(images, plane, solution, comm):
     """Warn of what is doubtful about data and images; return the suspect blocks, and add the mask to the images."""
-    data, pixels = part.data, images.pixels
-    doubtful = suspects(part.blocks, part.noise, reconstruction.l2_bounds) if reconstruction else []
+    part, pixels, found = solution.part, images.pixels, solution.reconstruction
+    data = part.data
+    doubtful = suspects(part.blocks, part.noise, found.l2_bounds) if found else []
     for line in named_suspects(part.blocks, doubtful):
         log.warn(line)
-    _caution(data, beyond_baselines(pixels["model"], grid.cell_rad, -comm.largest(-data.min_uv)))
-    if support is not None:
-        pixels["mask"] = check_confined(pixels["model"], support)
+    _caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
+    if plane.support is not None:
+        pixels["mask"] = check_confined(pixels["model"], plane.support)
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
-        _caution(data, left_outside(pixels["residual"], support, sigma))
+        _caution(data, left_outside(pixels["residual"], plane.support, sigma))
     return doubtful
 
 
 def split(data, blocks, comm=SERIAL):
-    """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`)."""
+    """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`).
+
+    Parameters
+    ----------
+    data : Visibilities
+    blocks : int or tuple of str
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    Split
+    """
     block_of_sample, infos = divide(data, blocks, comm)
     data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
     noise = noise_from_differences(data, offsets, comm)
@@ -211,7 +287,26 @@ def split(data, blocks, comm=SERIAL):
 
 
 def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
-    """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of."""
+    """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of.
+
+    Parameters
+    ----------
+    data : Visibilities
+    model : real (nx, ny)
+        Jy/pixel.
+    grid : ImageGrid
+    weighting : Weighting
+    options : SolverOptions
+        Whose number of threads is used.
+    plane : ImagePlane
+        For the beam.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    PlaneImages
+    """
     weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too

@@ -16,8 +16,9 @@ from casa_sara.casa.skyimage import SkyPlane
 from casa_sara.casa.spectrum import with_spectrum
 from casa_sara.noise import noise_from_differences
 from casa_sara.options import ImageGrid, Selection, SolverOptions
+from casa_sara.problem import Samples
 from casa_sara.solver.record import STOPPED_BY_USER
-from casa_sara.solving import solve_image
+from casa_sara.solving import density_of, solve_image
 from casa_sara.visibilities import sort_into_blocks
 
 __all__ = ["Injection", "can_be_repeated", "recover", "spectral_index_of"]
@@ -108,9 +109,10 @@ def _repeat(one, places, flux, selection, nthreads):
     block_of_sample, _ = divide(data, _blocks(one.parameters.get("blocks", "0")))
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise, options = noise_from_differences(data, offsets), _options(one.parameters, nthreads)
+    samples = Samples(data, offsets, density_of(data, selection, grid, options), noise)
     models = []
     for vis in (data.vis, data.vis + _visibilities(places, flux, data, grid)):
-        solved = solve_image(replace(data, vis=vis), offsets, noise, selection, grid, options)
+        solved = solve_image(replace(samples, data=replace(data, vis=vis)), grid, options)
         if solved.record.stop_code == STOPPED_BY_USER:  # an unfinished run does not show the resolution
             raise KeyboardInterrupt
         models.append(solved.model)

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from casa_sara.operators.measurement import MeasurementOperator, Summed
+from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
 from casa_sara.operators.sky import sky_operator
+from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.outliers import find_wild
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 from casa_sara.sharing import Layout
+from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import nnls
 from casa_sara.visibilities import Visibilities
 
@@ -23,19 +26,49 @@ LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 @dataclass
 class Samples:
-    """The samples in use, by blocks, and their numbers `kept` in the data given."""
+    """Block-sorted samples: all that were given, or those in use. Of several ranks each has its own.
+
+    Attributes
+    ----------
+    data : Visibilities
+        `vis` (Jy), `weight` (inverse variance) and `uvw` are used.
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    density : real (M,)
+        Sampling density of each sample; U = 1/density is the preconditioner.
+    noise : float (d,), optional
+        Noise of each block measured from the data, in units of what the weights say; NaN where unknown.
+    kept : int (M,)
+        Numbers of the samples in the data given.
+    """
 
     data: Visibilities
     offsets: np.ndarray
     density: np.ndarray
-    kept: np.ndarray
+    noise: np.ndarray | None = None
+    kept: np.ndarray = field(default=None)  # type: ignore[arg-type]  # all of them: see below
 
-    def without(self, index):
-        """Leave out samples, numbered as they are here."""
+    def __post_init__(self):
+        self.offsets = np.asarray(self.offsets)
+        if self.kept is None:
+            self.kept = np.arange(self.data.size)
+
+    def without(self, index: np.ndarray) -> Samples:
+        """Leave out samples, numbered as they are here.
+
+        Parameters
+        ----------
+        index : int (n,)
+
+        Returns
+        -------
+        Samples
+        """
         if len(index) == 0:
             return self
         good = np.delete(np.arange(self.data.size), index)
-        return Samples(self.data.take(good), np.searchsorted(good, self.offsets), self.density[good], self.kept[good])
+        return replace(self, data=self.data.take(good), offsets=np.searchsorted(good, self.offsets),
+                       density=self.density[good], kept=self.kept[good])
 
 
 @dataclass
@@ -62,17 +95,37 @@ class Problem:
 
     samples: Samples
     vis: np.ndarray
-    measurement: MeasurementOperator
+    measurement: Measurement
     precond: np.ndarray
     data_norm_sq: float
     unit_jy: float
     support: np.ndarray | None = None
 
     @classmethod
-    def of(cls, samples, grid, options, unit_jy, eps, data_norm_sq=None, support=None, comm=SERIAL):
+    def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions, unit_jy: float, eps: float,
+           data_norm_sq: float | None = None, support: np.ndarray | None = None, comm: Serial = SERIAL) -> Problem:
         """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`.
 
         Its norm is measured unless given.
+
+        Parameters
+        ----------
+        samples : Samples
+        grid : ImageGrid
+        options : SolverOptions
+        unit_jy : float
+            Jy/pixel in the unit of the image.
+        eps : float
+            Accuracy of the operator.
+        data_norm_sq : float, optional
+            ‖U^½Φ‖².
+        support : bool (nx, ny), optional
+        comm : casa_sara.parallel.Serial or MPI
+            Over whose ranks the samples are spread.
+
+        Returns
+        -------
+        Problem
         """
         data = samples.data
         sqrt_weight = np.sqrt(data.weight)
@@ -88,7 +141,9 @@ class Problem:
         return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support)
 
 
-def first_image(samples, problem_of, options, stopped=lambda: False, comm=SERIAL):
+def first_image(samples: Samples, problem_of: Callable[..., Problem], options: SolverOptions,
+                stopped: Callable[[], bool] = lambda: False,
+                comm: Serial = SERIAL) -> tuple[Problem, Findings, np.ndarray]:
     """Find the image of positivity and a vanishing sparsity alone, where the bounds start, and the model too.
 
     Parameters
@@ -111,24 +166,28 @@ def first_image(samples, problem_of, options, stopped=lambda: False, comm=SERIAL
         In `problem.unit_jy`.
     """
     everything, wild, layout = samples.data.size, [], Layout(samples.offsets, comm)
+    problem = problem_of(samples)
     for _ in range(ROUNDS):
-        problem = problem_of(samples)
         first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                                positivity=options.positivity, stopped=stopped, support=problem.support)
+        samples = problem.samples
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
-        count = comm.total(found.index.size)
-        if count == 0:
+        if comm.total(found.index.size) == 0:
             break
-        named = zip(layout.numbers(samples.kept[found.index]).tolist(), found.named(samples.data))
-        wild += [words for _, words in sorted(sum(comm.gather(list(named)), []), key=lambda one: one[0])]
-        samples = samples.without(found.index)
-    if count:
-        problem, residual = problem_of(samples), np.delete(residual, found.index)
+        wild += _told_of_all(found, samples, layout, comm)
+        problem, residual = problem_of(samples.without(found.index)), np.delete(residual, found.index)
+    samples = problem.samples
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
     nnls_norms = comm.norms(np.array([np.linalg.norm(residual[a:b])
                                       for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]))
     return problem, Findings(left_out, wild, nnls_norms, problem.data_norm_sq), first
+
+
+def _told_of_all(found, samples, layout, comm):
+    """Return what is told of the wild samples of all ranks, in the order in which one rank alone has them."""
+    numbered = zip(layout.numbers(samples.kept[found.index]).tolist(), found.named(samples.data))
+    return [told for _, told in sorted(sum(comm.gather(list(numbered)), []), key=lambda one: one[0])]
 
 
 def _preconditioner(samples, wanted, comm):

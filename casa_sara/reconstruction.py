@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,23 +10,47 @@ import numpy as np
 
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
+from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.papermethod import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 from casa_sara.problem import Findings, Problem, Samples, first_image
-from casa_sara.sharing import ALONE, Layout
+from casa_sara.sharing import ALONE, Crew, Layout
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
+from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve as solve_as_in_the_paper
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, solve
 from casa_sara.solver.statefile import digest
+from casa_sara.visibilities import Visibilities
 
-__all__ = ["Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
+__all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
 
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
+
+
+@dataclass(frozen=True)
+class Control:
+    """How a solution is followed, ended and kept.
+
+    Attributes
+    ----------
+    progress : callable
+        Called after every iteration with (ppd, record): see :func:`casa_sara.solver.reweighting.solve`.
+    stopped : callable
+        Asked after every iteration; True ends the solution with what there is. It ends the NNLS fit too, and one
+        iteration follows.
+    checkpoint : Checkpoint, optional
+        Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
+        whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
+    """
+
+    progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
+    stopped: Callable[[], bool] = lambda: False
+    checkpoint: Checkpoint | None = None
 
 
 @dataclass
@@ -65,33 +90,24 @@ class Reconstruction:
     wild: list[dict]
 
 
-def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=None,
-                progress=lambda ppd, record: None, stopped=lambda: False, checkpoint=None, support=None, crew=ALONE):
+def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
+                control: Control = Control(), support: np.ndarray | None = None,
+                crew: Crew = ALONE) -> Reconstruction:
     """Find the SARA image of block-sorted visibilities.
 
     Parameters
     ----------
-    data : Visibilities
-        `vis` (Jy), `weight` (inverse variance) and `uvw` are used.
-    offsets : int (d + 1,)
-        Block j is the slice offsets[j]:offsets[j + 1].
-    density : real (M,)
-        Sampling density of each sample; U = 1/density is the preconditioner.
+    samples : Samples
+        With the sampling density, and the noise where it is known.
     grid : ImageGrid
     options : SolverOptions
-    noise : float (d,), optional
-        Noise of each block measured from the data, relative to the MS weights; NaN where unknown.
     startmodel : real (nx, ny), optional
         First image, Jy/pixel.
-    progress, stopped : callable
-        See :func:`casa_sara.solver.reweighting.solve`; `stopped` ends the NNLS fit too, and one iteration follows.
-    checkpoint : Checkpoint, optional
-        Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
-        whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
+    control : Control
     support : bool (nx, ny), optional
         The model is exactly 0 elsewhere.
     crew : Crew
-        The ranks that share the work: `data`, `offsets` and `density` are this rank's part, all else is the same on all.
+        The ranks that share the work: `samples` are this rank's part, all else is the same on all.
 
     Returns
     -------
@@ -99,55 +115,76 @@ def reconstruct(data, offsets, density, grid, options, noise=None, startmodel=No
 
     Raises
     ------
+    ValueError
+        Noise levels that are neither one for all blocks nor one for each.
     CheckpointError
         The state that was read is not one of these data.
     """
-    comm = crew.comm
-    check_l2bound(options, len(offsets) - 1)
-    samples = Samples(data, np.asarray(offsets), density, np.arange(data.size))
+    comm, checkpoint = crew.comm, control.checkpoint
+    check_l2bound(options, len(samples.offsets) - 1)
     # images in units of the noise of one sample: every number is near 1
-    unit_jy = float(comm.mean(data.weight, dtype=float) ** -0.5)
+    unit_jy = float(comm.mean(samples.data.weight, dtype=float) ** -0.5)
     problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support, comm=comm,
-                         eps=operator_accuracy(data, offsets, noise, comm))
+                         eps=operator_accuracy(samples.data, samples.offsets, samples.noise, comm))
     layout = Layout(samples.offsets, comm)
     if checkpoint is not None:
-        gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=density)
-        digests = {name: digest(whole) for name, array in gathered.items()
-                   if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
-        spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
-        digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
-            blocks=layout.offsets, noise=noise, support=support, spectralindex=spectralindex).items()}
-        comm.once(checkpoint.identify, **digests)
+        _identify(checkpoint, samples, layout, grid, support, comm)
     if checkpoint is not None and comm.broadcast(checkpoint.state is not None):
-        solution = _resume(samples, layout, problem_of, options, noise, checkpoint, crew)
+        solution = _resume(samples, layout, problem_of, options, checkpoint, crew)
     else:
-        solution = _begin(samples, problem_of, options, noise, startmodel, stopped, crew)
-        if stopped():
-            checkpoint = None
+        solution = _begin(samples, problem_of, options, startmodel, control.stopped, crew)
+        if control.stopped():
+            control = replace(control, checkpoint=None)
+    record = _iterate(solution, options, control, layout, crew)
+    return _result(solution, record, samples, comm)
 
-    def keep(stage, now):
-        if checkpoint is None:
-            return
-        if comm.size == 1:
-            checkpoint.keep(lambda: solution.state(stage, layout, crew), solution.ppd.iteration, now)
-        elif comm.lead([checkpoint.due(now)])[0]:  # then all ranks take part in gathering the state
-            state = solution.state(stage, layout, crew)
-            comm.once(checkpoint.keep, lambda: state, solution.ppd.iteration, now=True)
 
-    found, ppd, bounds = solution.found, solution.ppd, solution.bounds
+def _identify(checkpoint, samples, layout, grid, support, comm):
+    """Tell the checkpoint, on rank 0, of what data the solution is: digests of all that it depends on."""
+    data = samples.data
+    gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=samples.density)
+    digests = {name: digest(whole) for name, array in gathered.items()
+               if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
+    spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
+    digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
+        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex).items()}
+    comm.once(checkpoint.identify, **digests)
+
+
+def _iterate(solution, options, control, layout, crew):
+    """Run Algorithm 2 to its end, keeping the state now and then; return the record."""
     schedule = schedule_of(options)
-    if found.noise_only:
+    if solution.found.noise_only:
         schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
     run = solve_as_in_the_paper if options.method == PAPER else solve
-    record = run(ppd, bounds, schedule, progress, stopped, keep, solution.stage)
+    keep = partial(_keep, solution, control.checkpoint, layout, crew)
+    return run(solution.ppd, solution.bounds, schedule, control.progress, control.stopped, keep, solution.stage)
+
+
+def _keep(solution, checkpoint, layout, crew, stage, now):
+    """Write the checkpoint if there is one and its time has come, or `now`."""
+    if checkpoint is None:
+        return
+    comm, iteration = crew.comm, solution.ppd.iteration
+    if comm.size == 1:
+        checkpoint.keep(lambda: solution.state(stage, layout, crew), iteration, now)
+    elif comm.lead([checkpoint.due(now)])[0]:  # then all ranks take part in gathering the state
+        state = solution.state(stage, layout, crew)
+        comm.once(checkpoint.keep, lambda: state, iteration, now=True)
+
+
+def _result(solution, record, samples, comm):
+    """Return what was found, in Jy."""
+    found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
     model = comm.own(ppd.model)
     if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
-    noise_jy_per_beam = unit_jy * bounds.total_weight**-0.5
-    return Reconstruction(model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
-                          found.data_norm_sq / unit_jy**2, ppd.threshold * unit_jy, noise_jy_per_beam,
-                          np.delete(samples.kept, found.left_out), found.wild)
+    return Reconstruction(
+        model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
+        data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
+        noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
+        wild=found.wild)
 
 
 @dataclass
@@ -160,21 +197,21 @@ class _Solution:
     stage: Stage | PaperStage | None = None
 
     @classmethod
-    def of(cls, problem, found, options, noise, crew):
+    def of(cls, problem, found, options, crew):
         """Put it together, at the very beginning."""
-        measurement, unit_jy = problem.measurement, problem.unit_jy
+        measurement, samples = problem.measurement, problem.samples
         dictionary = SaraDictionary(measurement.shape, crew.wavelets(options.wavelets), options.wavelevels,
                                     nthreads=options.nthreads, n_bases=len(options.wavelets))
         if options.method == PAPER:
             ppd = paper_iteration(problem, dictionary, found.data_norm_sq, options.positivity)
         else:
-            ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.samples.offsets, problem.precond,
+            ppd = AdaptivePPD(measurement, dictionary, problem.vis, samples.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=crew.comm)
-        ppd.unit_jy = unit_jy
+        ppd.unit_jy = problem.unit_jy
         if problem.support is not None:
             ppd.confine(problem.support)
-        weights = problem.samples.data.weight * np.float32(unit_jy**2)
-        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, noise, options))
+        weights = samples.data.weight * np.float32(problem.unit_jy**2)
+        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, samples.noise, options))
 
     def state(self, stage, layout, crew):
         """Return, on rank 0, all that :func:`_resume` needs beside the data and the parameters, as one rank alone has it."""
@@ -186,28 +223,29 @@ class _Solution:
         return dict(found=found, ppd=ppd, bounds=self.bounds.state(), stage=stage.state())
 
 
-def _begin(samples, problem_of, options, noise, startmodel, stopped, crew):
+def _begin(samples, problem_of, options, startmodel, stopped, crew):
     """Leave out wild samples, and begin from the first image or from `startmodel`."""
     problem, found, first = first_image(samples, problem_of, options, stopped, crew.comm)
-    paper = options.method == PAPER
-    if paper:
-        found.nnls_norms = block_norms(problem, problem_of, options, stopped)
-    solution = _Solution.of(problem, found, options, noise, crew)
-    threshold = first_threshold(options, first) if paper else None
-    if paper:
-        first = np.zeros_like(first)
-    else:
-        found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
     if startmodel is not None:
-        first = startmodel / np.float32(problem.unit_jy)
+        startmodel = startmodel / np.float32(problem.unit_jy)
         if problem.support is not None:
-            first *= problem.support
-    solution.ppd.start_from(first)
-    solution.ppd.rescale(threshold if paper else STEP_BALANCE * _mean_brightness(first))
+            startmodel *= problem.support
+    if options.method == PAPER:
+        found.nnls_norms = block_norms(problem, problem_of, options, stopped)
+        solution = _Solution.of(problem, found, options, crew)
+        model = np.zeros_like(first) if startmodel is None else startmodel
+        threshold = first_threshold(options, first)
+    else:
+        solution = _Solution.of(problem, found, options, crew)
+        found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
+        model = first if startmodel is None else startmodel
+        threshold = STEP_BALANCE * _mean_brightness(model)
+    solution.ppd.start_from(model)
+    solution.ppd.rescale(threshold)
     return solution
 
 
-def _resume(samples, layout, problem_of, options, noise, checkpoint, crew):
+def _resume(samples, layout, problem_of, options, checkpoint, crew):
     """Go on from the state that rank 0 has read."""
     with checkpoint.applied(crew.comm.rank == 0) as state:
         state = _plain_state(state, crew.comm)
@@ -215,7 +253,7 @@ def _resume(samples, layout, problem_of, options, noise, checkpoint, crew):
                             for name, value in state["found"].items()})
         found.left_out = layout.here(found.left_out)
         problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq)
-        solution = _Solution.of(problem, found, options, noise, crew)
+        solution = _Solution.of(problem, found, options, crew)
         ppd, kept = state["ppd"], Layout(solution.ppd.offsets, crew.comm)
         ppd |= {name: kept.scatter(ppd[name]) for name in SAMPLE_ARRAYS}
         ppd |= {name: crew.scatter_bases(ppd[name]) for name in BASIS_ARRAYS}
@@ -225,8 +263,15 @@ def _resume(samples, layout, problem_of, options, noise, checkpoint, crew):
     return solution
 
 
-def check_l2bound(options, blocks):
-    """Raise ValueError where the noise levels given are not one for all blocks, or one for each."""
+def check_l2bound(options: SolverOptions, blocks: int) -> None:
+    """Raise ValueError where the noise levels given are not one for all blocks, or one for each.
+
+    Parameters
+    ----------
+    options : SolverOptions
+    blocks : int
+        d.
+    """
     if options.databound == "fixed" and len(options.l2bound) not in (1, blocks):
         raise ValueError(f"l2bound = {list(options.l2bound)}: there are {blocks} blocks; give one noise level "
                          "for all of them, or one for each")
@@ -241,16 +286,41 @@ def _plain_state(state, comm):
     return state | dict(ppd=state["ppd"] | {name: spread.get(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)})
 
 
-def operator_accuracy(data, offsets, noise, comm=SERIAL):
-    """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown."""
+def operator_accuracy(data: Visibilities, offsets: np.ndarray, noise: np.ndarray | None,
+                      comm: Serial = SERIAL) -> float:
+    """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown.
+
+    Parameters
+    ----------
+    data : Visibilities
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    noise : float (d,) or None
+        Noise of each block relative to the MS weights.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    float
+    """
     if noise is None or not np.all(np.asarray(noise) > 0):
         return SMALLEST_EPS[np.dtype(np.float32)]
     level = np.repeat(np.asarray(noise, np.float32), np.diff(offsets))
     return choose_eps(data.vis, data.weight / level**2, comm=comm)
 
 
-def schedule_of(options):
-    """The solver's schedule for these task parameters."""
+def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
+    """The solver's schedule for these task parameters.
+
+    Parameters
+    ----------
+    options : SolverOptions
+
+    Returns
+    -------
+    Schedule or PaperSchedule
+    """
     if options.method == PAPER:
         return PaperSchedule.of(options)
     return Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,

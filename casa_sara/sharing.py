@@ -151,21 +151,52 @@ def series_with(data, residual, suspect, comm):
 
     A series is what one baseline and channel have seen.  One rank alone has them all; of several each is given those of
     its own suspects, and of the others'.
+
+    Parameters
+    ----------
+    data : Visibilities
+    residual : complex (M,)
+    suspect : int (n,)
+        Numbers of samples.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    data : Visibilities
+    residual : complex (M',)
+    suspect : int (n,)
+        The same samples among those.
     """
     if comm.size == 1:
         return data, residual, suspect
-    columns = np.stack([getattr(data.rows, name).astype(np.int64) for name in SERIES], axis=1)
-    row, chan = data.row[suspect], data.chan[suspect].astype(np.int64)
-    wanted = np.concatenate(comm.gather(np.unique(np.column_stack([columns[row], chan]), axis=0)))
+    of_row = np.stack([getattr(data.rows, name).astype(np.int64) for name in SERIES], axis=1)
+    own = np.column_stack([of_row[data.row[suspect]], data.chan[suspect].astype(np.int64)])
+    wanted = np.concatenate(comm.gather(np.unique(own, axis=0)))
     if len(wanted) == 0:
         return data, residual, suspect
-    number = np.unique(np.concatenate([wanted[:, :-1], columns]), axis=0, return_inverse=True)[1].ravel()
-    channels = 1 + max(int(wanted[:, -1].max()), int(data.chan.max(initial=0)))
-    keys = number[: len(wanted)] * channels + wanted[:, -1]
-    chosen = np.flatnonzero(np.isin(number[len(wanted):][data.row] * channels + data.chan, keys))
+    chosen = np.flatnonzero(_is_of(wanted, of_row, data.row, data.chan))
     parts, residuals = zip(*comm.gather((data.part(chosen), residual[chosen])))
     begin = sum(part.size for part in parts[: comm.rank])
     return _joined(parts), np.concatenate(residuals), begin + np.searchsorted(chosen, suspect)
+
+
+def _is_of(wanted, of_row, row, chan):
+    """Whether each sample is of one of some series, bool (M,).
+
+    Parameters
+    ----------
+    wanted : int64 (n, 7)
+        The columns `SERIES` and the channel of each series, n > 0.
+    of_row : int64 (R, 6)
+        The columns `SERIES` of each row.
+    row, chan : int (M,)
+        Row and channel of each sample.
+    """
+    number = np.unique(np.concatenate([wanted[:, :-1], of_row]), axis=0, return_inverse=True)[1].ravel()
+    of_wanted, of_row = number[: len(wanted)], number[len(wanted):]
+    channels = 1 + max(int(wanted[:, -1].max()), int(chan.max(initial=0)))
+    return np.isin(of_row[row] * channels + chan, of_wanted * channels + wanted[:, -1])
 
 
 def _joined(parts):

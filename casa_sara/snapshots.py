@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -117,26 +118,40 @@ def _blocks_of_groups(table, of_sample, group, comm):
 
 
 def _equal_blocks(table, of_sample, blocks, comm):
-    """Return the block of every sample for a given number of blocks of equal size."""
-    (ms, _), of_integration = _distinct([table.ms, table.time])
-    moment = of_integration[of_sample]
-    before, counts = comm.place(np.bincount(moment, minlength=ms.size))
-    order = np.argsort(moment, kind="stable")
-    own = np.bincount(moment, minlength=ms.size)
-    place = np.empty(order.size, np.int64)  # of each sample along MeasurementSets and time
-    place[order] = np.arange(order.size) + np.repeat(np.cumsum(counts) - counts + before - np.cumsum(own) + own, own)
-    sizes = np.bincount(ms, counts).astype(np.int64)
-    sizes = sizes[sizes > 0]
-    if blocks < sizes.size:
-        sizes, shares = np.array([sizes.sum()]), np.array([blocks])
-    else:
-        shares = np.ones(sizes.size, dtype=int)
-        for _ in range(blocks - sizes.size):
-            shares[np.argmax(sizes / shares)] += 1
+    """Return the block int32 (M,) of every sample for a given number of blocks of equal size."""
+    place, sizes = _places_in_time(table, of_sample, comm)
+    if blocks < sizes.size:  # then they cross from one MeasurementSet to another
+        sizes = np.array([sizes.sum()])
+    shares = _shares(sizes, blocks)
     ends = np.cumsum(sizes)
     part = np.searchsorted(ends, place, "right")
     along = (place - (ends - sizes)[part]) * shares[part] // sizes[part]
     return ((np.cumsum(shares) - shares)[part] + along).astype(np.int32)
+
+
+def _places_in_time(table, of_sample, comm):
+    """Return the place int64 (M,) of every sample among those of all ranks, and the samples of each MeasurementSet.
+
+    They go along MeasurementSets and time; of the same moment those of rank 0 come first, then those of rank 1, …
+    """
+    (ms, _), of_integration = _distinct([table.ms, table.time])
+    moment = of_integration[of_sample]
+    own = np.bincount(moment, minlength=ms.size)
+    before, counts = comm.place(own)
+    first = np.cumsum(counts) - counts + before  # place of this rank's first sample of each moment
+    order = np.argsort(moment, kind="stable")
+    place = np.empty(order.size, np.int64)
+    place[order] = np.arange(order.size) + np.repeat(first - (np.cumsum(own) - own), own)
+    sizes = np.bincount(ms, counts).astype(np.int64)
+    return place, sizes[sizes > 0]
+
+
+def _shares(sizes, blocks):
+    """Divide the blocks among parts of these sizes, one at least to each; the next goes to where blocks are largest."""
+    shares = np.ones(sizes.size, dtype=int)
+    for _ in range(blocks - sizes.size):
+        shares[np.argmax(sizes / shares)] += 1
+    return shares
 
 
 def _blocks_of_rows(rows):
@@ -177,6 +192,19 @@ def _time_spans(scan, time, samples):
     return np.minimum(np.floor(along * spans[scan]).astype(int), spans[scan] - 1)
 
 
+class _Span(NamedTuple):
+    """Pieces that follow each other in time: first and last time, samples, and the numbers of the pieces."""
+
+    start: float
+    end: float
+    samples: float
+    pieces: list[int]
+
+    def with_next(self, span):
+        """Return both as one."""
+        return _Span(self.start, max(self.end, span.end), self.samples + span.samples, self.pieces + span.pieces)
+
+
 def _join_small(piece, session, time, samples):
     """Join pieces that are too small to their neighbours; return the block of every row, along time."""
     start, end = _extents(piece, time)
@@ -187,20 +215,28 @@ def _join_small(piece, session, time, samples):
     blocks = 0
     for current in np.unique(home):
         here = np.flatnonzero(home == current)
-        spans = [[start[k], end[k], size[k], [k]] for k in here[np.argsort(start[here], kind="stable")]]
-        while len(spans) > 1:
-            k = min(range(len(spans)), key=lambda j: spans[j][2])
-            if spans[k][2] >= SMALLEST_SNAPSHOT:
-                break
-            before = spans[k][0] - spans[k - 1][1] if k > 0 else np.inf
-            after = spans[k + 1][0] - spans[k][1] if k + 1 < len(spans) else np.inf
-            left = k - 1 if before <= after else k
-            one, two = spans[left : left + 2]
-            spans[left : left + 2] = [[one[0], max(one[1], two[1]), one[2] + two[2], one[3] + two[3]]]
-        for span in spans:
-            number[span[3]] = blocks
-            blocks += 1
+        along = here[np.argsort(start[here], kind="stable")]
+        spans = _joined([_Span(start[k], end[k], size[k], [k]) for k in along])
+        for block, span in enumerate(spans, blocks):
+            number[span.pieces] = block
+        blocks += len(spans)
     return number[piece]
+
+
+def _joined(spans):
+    """Join the smallest span to the neighbour nearer in time, as long as it is too small and has one."""
+    while len(spans) > 1:
+        k = min(range(len(spans)), key=lambda j: spans[j].samples)
+        if spans[k].samples >= SMALLEST_SNAPSHOT:
+            break
+        left = k - 1 if _gap(spans, k - 1) <= _gap(spans, k) else k
+        spans[left : left + 2] = [spans[left].with_next(spans[left + 1])]
+    return spans
+
+
+def _gap(spans, k):
+    """Time from span k to the next, infinite where one of them does not exist."""
+    return spans[k + 1].start - spans[k].end if 0 <= k < len(spans) - 1 else np.inf
 
 
 def _block_infos(ms_names, rows, of_sample, block_of_sample, comm):

@@ -4,28 +4,33 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 
 import numpy as np
 
 import casa_sara
 from casa_sara.casa import log
 from casa_sara.casa.catalogue import located
+from casa_sara.casa.imageplane import ImagePlane
 from casa_sara.casa.products import CHECKPOINT
 from casa_sara.casa.weights import sampling_density
 from casa_sara.deadline import Deadline
 from casa_sara.interrupt import stop_on_interrupt
-from casa_sara.parallel import SERIAL
-from casa_sara.reconstruction import reconstruct, schedule_of
-from casa_sara.sharing import ALONE
+from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
+from casa_sara.parallel import SERIAL, Serial
+from casa_sara.problem import Samples
+from casa_sara.reconstruction import Control, Reconstruction, reconstruct, schedule_of
+from casa_sara.sharing import ALONE, Crew
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.islands import STRUCTURE
 from casa_sara.solver.nnls import NNLS_ITERATIONS
-from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED, SolverRecord
 from casa_sara.timing import Pace
-from casa_sara.visibilities import clock
+from casa_sara.visibilities import BlockInfo, Visibilities, clock
 
-__all__ = ["Watch", "checkpoint_of", "list_islands", "solve_image", "without_wild"]
+__all__ = ["Watch", "checkpoint_of", "density_of", "list_islands", "solve_image", "without_wild"]
 
 MOST_NAMED = 20  # wild samples that the log names one by one
 MOST_TOLD = 20  # islands of emission that the log lists
@@ -33,13 +38,14 @@ MOST_TOLD = 20  # islands of emission that the log lists
 
 @dataclass
 class Watch:
-    """The clocks of a solution: when it has to end, and how long an iteration takes."""
+    """When a solution has to end, how long an iteration takes, and where its state is kept, or was."""
 
     deadline: Deadline
     pace: Pace
+    checkpoint: Checkpoint
 
 
-def checkpoint_of(selection, grid, options, output):
+def checkpoint_of(selection: Selection, grid: ImageGrid, options: SolverOptions, output: Output) -> Checkpoint:
     """Return the checkpoint of a run, with the task parameters on which the model depends.
 
     Where the data are is none of them (they are known by their contents), nor is how many threads there are.
@@ -52,26 +58,40 @@ def checkpoint_of(selection, grid, options, output):
     return Checkpoint(output.imagename + CHECKPOINT, casa_sara.__version__, parameters, log.info, log.warn)
 
 
-def solve_image(data, offsets, noise, selection, grid, options, start=None, checkpoint=None, watch=None, support=None,
-                crew=ALONE):
-    """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
+def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid, options: SolverOptions,
+               comm: Serial = SERIAL) -> np.ndarray:
+    """Return the sampling density of each sample, real (M,): 1 where no preconditioner is asked for.
 
     Parameters
     ----------
     data : Visibilities
-    offsets : int (d + 1,)
-        Block j is the slice offsets[j]:offsets[j + 1].
-    noise : float (d,)
-        Measured in the data, relative to the MS weights; NaN where unknown.
     selection : Selection or None
-        That gave the data, for their sampling density; None where they are but a part of it.
+        That gave the data; None where they are but a part of it.
     grid : ImageGrid
     options : SolverOptions
-    start : float32 (nx, ny), optional
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+    """
+    if not options.precondition:
+        return np.ones(data.size, np.float32)
+    log.info("computing the density of the uv coverage")
+    return sampling_density(data, selection, grid, comm)
+
+
+def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
+                watch: Watch | None = None, support: np.ndarray | None = None, crew: Crew = ALONE) -> Reconstruction:
+    """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
+
+    Parameters
+    ----------
+    samples : Samples
+        With the sampling density (:func:`density_of`) and the noise.
+    grid : ImageGrid
+    options : SolverOptions
+    startmodel : float32 (nx, ny), optional
         First model, Jy/pixel.
-    checkpoint : Checkpoint, optional
-        Where the state is kept now and then, or was.
     watch : Watch, optional
+        Without it there is no limit of time and no checkpoint.
     support : bool (nx, ny), optional
         The model is 0 elsewhere.
     crew : casa_sara.sharing.Crew
@@ -82,40 +102,43 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     Reconstruction
     """
     progress = log.Progress()
-    if options.precondition:
-        progress.prepare("computing the density of the uv coverage")
-        density = sampling_density(data, selection, grid, crew.comm)
-    else:
-        density = np.ones(data.size, np.float32)
-    expected = schedule_of(options).expected_iterations
     preparing = _Preparing(progress)
-
-    def report(ppd, record):
-        preparing.over = True
-        begun = record.resumed[-1] if record.resumed else 0
-        if watch and (line := watch.pace(ppd.iteration - begun)):
-            log.info(line)
-        fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-        progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.block_sizes.sum()):.4g}, "
-                 f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
-                 f"{record.reweighting[-1]} re-weightings", fraction)
-
-    def stopped():
-        preparing()
-        return bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0])
-
+    report = partial(_report, progress, preparing, schedule_of(options).expected_iterations, watch.pace if watch else None)
     with stop_on_interrupt() as pressed:
-        if not (checkpoint and checkpoint.state is not None):
+        def stopped():
+            preparing()
+            return bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0])
+
+        control = Control(report, stopped, watch.checkpoint if watch else None)
+        if not (control.checkpoint and control.checkpoint.state is not None):
             progress.prepare("computing the norm of the measurement operator, and the first image by non-negative least squares "
                              f"(NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
-        reconstruction = reconstruct(data, offsets, density, grid, options, noise, start, report, stopped, checkpoint,
-                                     support, crew)
+        reconstruction = reconstruct(samples, grid, options, startmodel, control, support, crew)
     progress.close()
     record = reconstruction.record
     if record.stop_code == STOPPED_BY_USER and not crew.comm.broadcast(pressed()):
         record.stop_code = TIME_LIMIT
+    _log_end(reconstruction, samples.offsets, control.checkpoint, crew.comm)
+    return reconstruction
+
+
+def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd, record):
+    """Show how far the solution is, after every iteration of `expected` ones."""
+    preparing.over = True
+    begun = record.resumed[-1] if record.resumed else 0
+    if pace and (line := pace(ppd.iteration - begun)):
+        log.info(line)
+    fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
+    progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.block_sizes.sum()):.4g}, "
+             f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
+             f"{record.reweighting[-1]} re-weightings", fraction)
+
+
+def _log_end(reconstruction, offsets, checkpoint, comm):
+    """Write to the log why the solution ended and what it found."""
+    record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
-    samples = _samples_of_blocks(reconstruction, offsets, crew.comm)
+    samples = _samples_of_blocks(reconstruction, offsets, comm)
     say(f"{record.stop_description}, after {record.iteration[-1]} iterations and {record.reweighting[-1]} re-weightings: "
         f"reduced chi-square {_reduced(record.residual_norm[-1], samples.sum()):.4g}, model flux "
         f"{record.model_flux[-1]:.5g} Jy")
@@ -128,7 +151,6 @@ def solve_image(data, offsets, noise, selection, grid, options, start=None, chec
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")
-    return reconstruction
 
 
 class _Preparing:
@@ -167,8 +189,25 @@ def _samples_of_blocks(reconstruction, offsets, comm):
     return comm.sum(np.diff(np.searchsorted(reconstruction.kept, offsets)))
 
 
-def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):
-    """Leave out the outliers that the reconstruction left out, and list them in the log."""
+def without_wild(data: Visibilities, blocks: list[BlockInfo], offsets: np.ndarray, reconstruction: Reconstruction,
+                 comm: Serial = SERIAL) -> tuple[Visibilities, list[BlockInfo]]:
+    """Leave out the outliers that the reconstruction left out, and list them in the log.
+
+    Parameters
+    ----------
+    data : Visibilities
+    blocks : list of d BlockInfo
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    reconstruction : Reconstruction
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    data : Visibilities
+    blocks : list of d BlockInfo
+    """
     wild = reconstruction.wild
     if not wild:
         return data, blocks
@@ -184,7 +223,8 @@ def without_wild(data, blocks, offsets, reconstruction, comm=SERIAL):
     return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks
 
 
-def list_islands(record, plane, cell_rad, significance, comm=SERIAL):
+def list_islands(record: SolverRecord, plane: ImagePlane, cell_rad: tuple[float, float], significance: float,
+                 comm: Serial = SERIAL) -> None:
     """Give the islands of a model their sky coordinates, list them in the log, and warn where the residual is not noise.
 
     Parameters

@@ -96,7 +96,7 @@ def measure(data, offsets, grid, options, reading):
     if options.method == PAPER:
         dictionary = paper_prior(dictionary, measurement)
     ppd = AdaptivePPD(measurement, dictionary, vis, offsets, precond, bound, options.positivity)
-    ppd.threshold, ppd.l1_weights = 1.0, dictionary.allocate()
+    ppd.threshold = 1.0
     schedule = schedule_of(options)
     of_blocks = schedule.nnls_iterations if options.method == PAPER else 0
     return Timing(reading, building, pair, first, _seconds(ppd.step), writing, schedule.expected_iterations,

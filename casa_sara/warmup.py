@@ -43,5 +43,5 @@ def use_every_kernel() -> None:
     ppd = AdaptivePPD(measurement, dictionary, vis, [0, 3], precond, norm_sq)
     ppd.start_from(model)
     ppd.step()
-    ppd.l1_weights = dictionary.reweight(ppd.model, 1.0, 1.0, dictionary.allocate())
+    dictionary.reweight(ppd.model, 1.0, 1.0, ppd.l1_weights)
     ppd.step()

@@ -17,7 +17,8 @@ from test_visibilities import observation
 
 from casa_sara.interrupt import stop_on_interrupt
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.reconstruction import reconstruct
+from casa_sara.problem import Samples
+from casa_sara.reconstruction import Control, reconstruct
 from casa_sara.solver import checkpoint as module
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
@@ -291,9 +292,9 @@ def image(sky, path="", stop_at=None, **changes):
         if os.path.exists(path):
             checkpoint.open()
     reached = [0]
-    return reconstruct(data, offsets, np.ones(data.size), GRID, OPTIONS, changes.get("noise", np.array([1.0, np.nan])),
-                       progress=lambda ppd, record: reached.__setitem__(0, ppd.iteration),
-                       stopped=lambda: reached[0] == stop_at, checkpoint=checkpoint)
+    samples = Samples(data, offsets, np.ones(data.size), changes.get("noise", np.array([1.0, np.nan])))
+    return reconstruct(samples, GRID, OPTIONS, control=Control(
+        lambda ppd, record: reached.__setitem__(0, ppd.iteration), lambda: reached[0] == stop_at, checkpoint))
 
 
 def test_a_reconstruction_goes_on_with_all_that_was_found(sky, tmp_path, monkeypatch):

@@ -202,7 +202,8 @@ def test_stopped_cube_goes_on_to_the_same_images(line, solved, monkeypatch, aske
     assert flux[0] > 0 and flux[3] == 0
     assert image("run.residual")[0][:, :, 3].any()  # dirty
     goes_on = []
-    monkeypatch.setattr(cube, "solve_image", lambda *args: goes_on.append(args[7].state is not None) or solve(*args))
+    monkeypatch.setattr(cube, "solve_image",
+                        lambda *args: goes_on.append(args[-1].checkpoint.state is not None) or solve(*args))
     again = tsara(restart=True, **options)
     assert goes_on == [asked > 100, False]
     for product in ("model", "residual", "image", "psf"):

@@ -19,7 +19,7 @@ from casa_sara.operators.norms import power_method
 from casa_sara.options import SARA_BASES, ImageGrid, SolverOptions
 from casa_sara.papermethod import block_norms
 from casa_sara.problem import Problem, Samples
-from casa_sara.reconstruction import reconstruct, schedule_of
+from casa_sara.reconstruction import Control, reconstruct, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve
@@ -305,7 +305,7 @@ def test_first_bounds_are_nnls_of_each_block_alone(blocks):
     data, offsets = blocks
     density = np.random.default_rng(1).uniform(1, 30, data.size)
     problem_of = partial(Problem.of, grid=GRID, options=OPTIONS, unit_jy=0.2, eps=1e-6)
-    samples = Samples(data, offsets, density, np.arange(data.size))
+    samples = Samples(data, offsets, density)
     found = block_norms(problem_of(samples), problem_of, OPTIONS, lambda: False)
     ix, iy = np.divmod(np.arange(40 * 48), 48)
     phi = np.exp(2j * np.pi * CELL * (np.outer(data.uvw[0], 20 - ix) + np.outer(data.uvw[1], iy - 24)))
@@ -325,9 +325,9 @@ def image(blocks, path="", stop_at=None, options=OPTIONS):
         if os.path.exists(path):
             checkpoint.open()
     reached = [0]
-    return reconstruct(data, offsets, np.ones(data.size), GRID, options, np.array([1.0, 2.5]),
-                       progress=lambda ppd, record: reached.__setitem__(0, ppd.iteration),
-                       stopped=lambda: reached[0] == stop_at, checkpoint=checkpoint)
+    samples = Samples(data, offsets, np.ones(data.size), np.array([1.0, 2.5]))
+    return reconstruct(samples, GRID, options, control=Control(
+        lambda ppd, record: reached.__setitem__(0, ppd.iteration), lambda: reached[0] == stop_at, checkpoint))
 
 
 def test_a_reconstruction_is_kept_and_goes_on(blocks, tmp_path, monkeypatch):

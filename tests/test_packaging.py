@@ -40,10 +40,10 @@ ROOMS = {
     "sharing": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
     "balance": {"casa_sara.operators", "casa_sara.sharing", "numpy"},
     "problem": {
-        "casa_sara.operators", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing", "casa_sara.solver",
-        "casa_sara.visibilities", "numpy",
+        "casa_sara.operators", "casa_sara.options", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing",
+        "casa_sara.solver", "casa_sara.visibilities", "numpy",
     },
-    "papermethod": {"casa_sara.operators", "casa_sara.problem", "casa_sara.solver", "numpy"},
+    "papermethod": {"casa_sara.operators", "casa_sara.options", "casa_sara.problem", "casa_sara.solver", "numpy"},
     "resources": set(),
     "options": set(),
     "visibilities": {"numpy"},

@@ -9,7 +9,8 @@ from test_visibilities import observation
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.reconstruction import reconstruct
+from casa_sara.problem import Samples
+from casa_sara.reconstruction import Control, reconstruct
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.islands import islands_of, look_at
@@ -246,10 +247,9 @@ def image(sources=(), shape=(48, 48), seed=2, support=None, stop_at=None, checkp
     data.vis[:] = sums.of(*((flux, shape[0] // 2 + x, shape[1] // 2 + y, fwhm) for flux, x, y, fwhm in sources))
     data.vis += louder * sums.noise(seed)
     reached, grid = [0], ImageGrid(shape, (CELL, CELL))
-    return reconstruct(data, offsets, np.ones(data.size), grid, SolverOptions(**OPTIONS | changes), np.ones(2),
-                       support=support, checkpoint=checkpoint,
-                       progress=lambda ppd, record: reached.__setitem__(0, ppd.iteration),
-                       stopped=lambda: reached[0] == stop_at)
+    samples = Samples(data, offsets, np.ones(data.size), np.ones(2))
+    return reconstruct(samples, grid, SolverOptions(**OPTIONS | changes), support=support, control=Control(
+        lambda ppd, record: reached.__setitem__(0, ppd.iteration), lambda: reached[0] == stop_at, checkpoint))
 
 
 POINT = (20 * NOISE, 6.0, -4.0, 0)

@@ -18,6 +18,7 @@ if sys.argv[1] == "warm":
 before = loaded()
 
 from casa_sara.options import ImageGrid, SolverOptions
+from casa_sara.problem import Samples
 from casa_sara.reconstruction import reconstruct
 from casa_sara.visibilities import RowTable, Visibilities
 
@@ -31,8 +32,8 @@ data = Visibilities(
     weight=np.full(rows, 100, np.float32), imaging_weight=np.full(rows, 100, np.float32),
     uvw=rng.normal(size=(3, rows)) * 1e4, row=np.arange(rows, dtype=np.int32), chan=np.zeros(rows, np.int16), rows=table,
     ms_names=("a.ms",), notes=[], phase_center={}, freq_range_hz=(1e9, 2e9), spws={0: (0,)}, observatory="VLA", dropped={})
-found = reconstruct(data, np.array([0, 30, rows]), np.ones(rows, np.float32), ImageGrid((32, 48), (5e-6, 5e-6)),
-                    SolverOptions(niter=70, nreweights=2))
+found = reconstruct(Samples(data, np.array([0, 30, rows]), np.ones(rows, np.float32)),
+                    ImageGrid((32, 48), (5e-6, 5e-6)), SolverOptions(niter=70, nreweights=2))
 assert found.record.iteration[-1] >= 60
 new = {name for name, count in loaded().items() if count != before.get(name, 0)}
 print(sorted(new))

@@ -38,7 +38,7 @@ class Frame:
         """The same with pixels that are as wide as they are high: regions keep their shape only on these."""
         return self._wcs(self.cell_arcsec[1])
 
-    def square_x(self, x):
+    def square_x(self, x: np.ndarray) -> np.ndarray:
         """Return pixel coordinates x on the square pixels."""
         middle = self.shape[0] // 2
         return (x - middle) * self.cell_arcsec[0] / self.cell_arcsec[1] + middle

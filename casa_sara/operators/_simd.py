@@ -178,6 +178,25 @@ def filter_bank(lags, along=False, masked=False):
     where `offsets` is a tuple of byte offsets and `taps` an array (2, ≥ length).  Every input vector is loaded once
     and every tap broadcast once.
 
+    Across lines, for two offsets (V0, V1 are the vectors there) and lags (0, 0, 2, 2), which is the analysis of lines::
+
+                      offsets[0]   offsets[1]
+        lines[0]  ▶  ····[ V0 ]·······[ V1 ]····    taps[:, 0] to sums 0, 1
+        lines[1]  ▶  ····[ V0 ]·······[ V1 ]····    taps[:, 1] to sums 0, 1
+        lines[2]  ▶  ····[ V0 ]·······[ V1 ]····    taps[:, 2] to sums 0, 1;  taps[:, 0] to sums 2, 3
+        lines[3]  ▶  ····[ V0 ]·······[ V1 ]····    taps[:, 3] to sums 0, 1;  taps[:, 1] to sums 2, 3
+           ⋮             ▼            ▼
+                     sums 0 … 3   sums 4 … 7       even sums with the taps of row 0, odd ones with those of row 1
+
+    Along a line of pixels x, whose even and odd pixels lie apart, so that a step by two pixels is one value::
+
+        line(0) = lines[0]              x0 x2 x4 x6 …
+        line(1) = lines[1]              x1 x3 x5 x7 …
+        line(2) = lines[0] + 1 value    x2 x4 x6 x8 …
+        line(3) = lines[1] + 1 value    x3 x5 x7 x9 …
+                                        ▼  ▼  ▼  ▼
+                       one lane each:   k = 0, 1, 2, 3, …, of Σ_t taps[·, t] x[2k + t]
+
     Parameters
     ----------
     lags : callable
@@ -194,36 +213,57 @@ def filter_bank(lags, along=False, masked=False):
         sums = types.UniTuple(vec, len(offsets) * len(lags(2)))
 
         def codegen(context, builder, sig, args):
+            lines_at, shifts, taps_at, count, first_lanes = args
             if along:
-                pair = cgutils.unpack_tuple(builder, args[0])
-                line = lambda p: builder.add(pair[p % 2], ir.Constant(INT, p // 2 * vec.size))
+                line = _interleaved(builder, lines_at, vec.size)
             else:
-                table = context.make_array(lines)(context, builder, args[0]).data
-                line = lambda p: builder.load(builder.gep(table, [ir.Constant(INT, p)]))
-            tap = context.make_array(taps)(context, builder, args[2])
-            row = builder.udiv(cgutils.unpack_tuple(builder, tap.strides)[0], ir.Constant(INT, vec.size))
-            starts = [tap.data, builder.gep(tap.data, [row])]
-            shifts = cgutils.unpack_tuple(builder, args[1])
-            done = builder.append_basic_block("done")
-            cases = {n: builder.append_basic_block(f"taps{n}") for n in range(2, MAX_TAPS + 1, 2)}
-            switch = builder.switch(args[3], cases[MAX_TAPS])
-            results = []
-            for n, block in cases.items():
-                if n < MAX_TAPS:
-                    switch.add_case(ir.Constant(INT, n), block)
-                builder.position_at_end(block)
-                results.append(_unrolled(builder, vec, n, lags(n), line, starts, shifts, args[4] if masked else None))
-                builder.branch(done)
-            builder.position_at_end(done)
-            merged = [builder.phi(vec.llvm) for _ in range(len(sums))]
-            for values, block in zip(results, cases.values()):
-                for phi, value in zip(merged, values):
-                    phi.add_incoming(value, block)
-            return cgutils.pack_array(builder, merged)
+                line = _tabulated(builder, context.make_array(lines)(context, builder, lines_at).data)
+            starts = _tap_rows(builder, context.make_array(taps)(context, builder, taps_at), vec.size)
+            shifts = cgutils.unpack_tuple(builder, shifts)
+            found = _for_each_length(builder, count, lambda length: _unrolled(
+                builder, vec, length, lags(length), line, starts, shifts, first_lanes if masked else None))
+            return cgutils.pack_array(builder, found)
 
         return sums(lines, offsets, taps, types.intp, types.intp), codegen
 
     return bank
+
+
+def _interleaved(builder, lines, size):
+    """Address of line(p) along two interleaved lines, as a function of p."""
+    pair = cgutils.unpack_tuple(builder, lines)
+    return lambda p: builder.add(pair[p % 2], ir.Constant(INT, p // 2 * size))
+
+
+def _tabulated(builder, table):
+    """Address of line(p) in a table of addresses, as a function of p."""
+    return lambda p: builder.load(builder.gep(table, [ir.Constant(INT, p)]))
+
+
+def _tap_rows(builder, taps, size):
+    """Pointers to the two rows of an array of taps."""
+    row = builder.udiv(cgutils.unpack_tuple(builder, taps.strides)[0], ir.Constant(INT, size))
+    return [taps.data, builder.gep(taps.data, [row])]
+
+
+def _for_each_length(builder, length, build):
+    """Branch to what `build` makes for each even length up to MAX_TAPS; return the vectors of the one that is run."""
+    done = builder.append_basic_block("done")
+    cases = {n: builder.append_basic_block(f"taps{n}") for n in range(2, MAX_TAPS + 1, 2)}
+    switch = builder.switch(length, cases[MAX_TAPS])
+    results = []
+    for n, block in cases.items():
+        if n < MAX_TAPS:
+            switch.add_case(ir.Constant(INT, n), block)
+        builder.position_at_end(block)
+        results.append(build(n))
+        builder.branch(done)
+    builder.position_at_end(done)
+    merged = [builder.phi(value.type) for value in results[0]]
+    for values, block in zip(results, cases.values()):
+        for phi, value in zip(merged, values):
+            phi.add_incoming(value, block)
+    return merged
 
 
 def _unrolled(builder, vec, length, lags, line, taps, offsets, lanes):

@@ -23,7 +23,7 @@ CHUNK = 16  # lines of level 1 done in one go
 MARGIN = MAX_TAPS // 2 - 1  # image lines needed before those of a chunk
 WINDOW_ROWS = 2 * CHUNK + MAX_TAPS
 ZERO, ONE = np.int64(0), np.int64(1)  # literals would make Numba compile the callee for each
-SOURCE = "bb9659b6ab76"  # digest of _simd.py and _wavelet_lines.py: the cache of compiled code watches this file only
+SOURCE = "b03389d0c5a7"  # digest of _simd.py and _wavelet_lines.py: the cache of compiled code watches this file only
 
 stage = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
 
@@ -93,7 +93,20 @@ def _address(array, i):
 
 @compiled
 def _analyse(source, origin, b, level, begin, end, job, worker):
-    """Lines [begin, end) of the four bands of one level; the first line of `source` is line `origin` of that image."""
+    """Lines [begin, end) of the four bands of one level; the first line of `source` is line `origin` of that image.
+
+    Two lines r, r + 1 of each band at a time, by way of eight scratch lines; a filter begins at pixel s = `start`::
+
+        source                         scratch                        coefs[b] (aa in `approx` but at the deepest level)
+        line 2r + s          ─┐        0  a[r] even pixels  ─┐                 ◀─ right ─▶
+             2r + s + 1       │ across 1  a[r] odd pixels    │ along  ┌───────────┬───────────┐
+               ⋮              ├──────▶ 2  d[r] even pixels   ├──────▶ │ aa, line r│ ad, line r│ ▲
+             2r + s + F + 1  ─┘ lines  3  d[r] odd pixels   ─┘        ├───────────┼───────────┤ down
+        (`table` has their             4 … 7  the same of r + 1       │ da, line r│ dd, line r│ ▼
+        addresses, periodic)                                          └───────────┴───────────┘
+
+    The pixels of a scratch line begin at its value HALO: :func:`wrap` continues them periodically to both sides.
+    """
     filters, target, work = job
     length, size = filters.lengths[b], source.itemsize
     start = 1 - length // 2

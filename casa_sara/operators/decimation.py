@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from casa_sara.operators import kaiser_bessel
@@ -54,7 +55,7 @@ class AxisDecimation:
         z has samples i = start … start + count − 1.
     """
 
-    def __init__(self, size, band, eps, precision):
+    def __init__(self, size: int, band: tuple[float, float], eps: float, precision: float) -> None:
         self.centre, reach = (band[0] + band[1]) / 2, (band[1] - band[0]) / 2
         self.factor = int(max(1, min(LARGEST_FACTOR, FULLEST_BAND / max(reach, 1e-9))))
         largest_gain = np.clip(np.sqrt(eps / (2 * precision)), 1.5, 10)
@@ -64,12 +65,32 @@ class AxisDecimation:
         self.start = -((size // 2 + half) // self.factor)
         self.count = (size - 1 - size // 2 + half) // self.factor - self.start + 1
 
-    def response(self, frequency):
-        """ĥ(frequency − centre)/D, the factor on the spectrum."""
+    def response(self, frequency: np.ndarray) -> np.ndarray:
+        """ĥ(frequency − centre)/D, the factor on the spectrum.
+
+        Parameters
+        ----------
+        frequency : real, any shape
+            Cycles per pixel.
+
+        Returns
+        -------
+        float64, of the shape of frequency
+        """
         return _spectrum(self._lowpass, np.asarray(frequency) - self.centre) / self.factor
 
-    def modulation(self, samples):
-        """exp(2πi·centre·D·i) at the given samples i, which moves the band's centre to frequency 0."""
+    def modulation(self, samples: np.ndarray) -> np.ndarray:
+        """exp(2πi·centre·D·i) at the given samples i, which moves the band's centre to frequency 0.
+
+        Parameters
+        ----------
+        samples : int (n,)
+            Numbers i.
+
+        Returns
+        -------
+        complex128 (n,)
+        """
         return np.exp(2j * np.pi * self.centre * self.factor * samples)
 
 
@@ -122,8 +143,25 @@ class Separable(NamedTuple):
     gains: np.ndarray  # complex (count,), what it is multiplied with
 
 
-def separable(axis, size, cells, factors, dtype):
-    """`axis`, of `size` pixels, with its samples' cells and further factors, for arithmetic in complex `dtype`."""
+def separable(axis: AxisDecimation, size: int, cells: np.ndarray, factors: np.ndarray,
+              dtype: npt.DTypeLike) -> Separable:
+    """`axis`, of `size` pixels, with its samples' cells and further factors, for arithmetic in complex `dtype`.
+
+    Parameters
+    ----------
+    axis : AxisDecimation
+    size : int
+        Pixels.
+    cells : int64 (count,)
+        Where each sample goes in the grid.
+    factors : float64 (count,)
+        What each is multiplied with, beside the modulation.
+    dtype : complex64 or complex128
+
+    Returns
+    -------
+    Separable
+    """
     margin = (GROUP - 1) * axis.factor
     first = axis.factor * axis.start - axis.taps.size // 2 + size // 2
     gains = factors * axis.modulation(axis.start + np.arange(axis.count))

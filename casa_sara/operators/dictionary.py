@@ -9,10 +9,12 @@ of the synthesis, which keeps the frame Parseval.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import pywt
 from scipy.ndimage import maximum_filter
 
@@ -71,7 +73,8 @@ class SaraDictionary:
     The workspaces belong to the object: one call at a time.  Different objects may be used from different threads.
     """
 
-    def __init__(self, shape, wavelets=SARA_BASES, levels=4, dtype=np.float32, nthreads=1, n_bases=None):
+    def __init__(self, shape: tuple[int, int], wavelets: Sequence[str] = SARA_BASES, levels: int = 4,
+                 dtype: npt.DTypeLike = np.float32, nthreads: int = 1, n_bases: int | None = None) -> None:
         self.shape = tuple(int(n) for n in shape)
         self.wavelets = tuple(wavelets)
         self.levels, self.dtype = int(levels), np.dtype(dtype)
@@ -110,11 +113,11 @@ class SaraDictionary:
             scratch=_aligned((threads, kernels.SCRATCH_ROWS, width), self.dtype),
             tables=np.zeros((threads, 2, kernels.TABLE_SIZE), np.int64))
 
-    def allocate(self):
+    def allocate(self) -> np.ndarray:
         """Return a zeroed coefficient array of `coef_shape`, aligned as the kernels like it."""
         return _aligned(self.coef_shape, self.dtype)
 
-    def bands(self):
+    def bands(self) -> list[Band]:
         """Return the list of all :class:`Band`, level 1 the finest.
 
         Orientations are PyWavelets' keys: 'da' is detail along the first axis, approximation along the second; 'aa' is
@@ -135,14 +138,36 @@ class SaraDictionary:
                         found.append(Band(b, level, orientation, where))
         return found
 
-    def analysis(self, image, out=None):
-        """Return Ψ† image, an array of `coef_shape`, in `out` where given."""
+    def analysis(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return Ψ† image, an array of `coef_shape`, in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : real coef_shape, optional
+            Receives the result.
+
+        Returns
+        -------
+        real coef_shape
+        """
         out = self.allocate() if out is None else self._checked(out, "out", self.coef_shape)
         self._analyse(image, self._job(out, kernels.KEEP))
         return out
 
-    def synthesis(self, coefs, out=None):
-        """Return the image Ψ coefs, in `out` where given."""
+    def synthesis(self, coefs: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the image Ψ coefs, in `out` where given.
+
+        Parameters
+        ----------
+        coefs : real coef_shape
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
         job = self._job(coefs, kernels.KEEP)
@@ -150,12 +175,14 @@ class SaraDictionary:
         self._workers.run(kernels.synthesise_finest, out, job)
         return out
 
-    def dual_step(self, model_bar, dual, threshold, weights=None, out=None, relaxation=1.0):
+    def dual_step(self, model_bar: np.ndarray, dual: np.ndarray, threshold: float | np.ndarray,
+                  weights: np.ndarray | None = None, out: np.ndarray | None = None,
+                  relaxation: float = 1.0) -> np.ndarray:
         """Update the dual variable of the prior in place and return Ψ dual, in one sweep over the bases.
 
-        With u = dual + Ψ† model_bar,
+        With c = dual + Ψ† model_bar,
 
-            dual ← dual + ρ(clip(u, ± threshold·weights) − dual),   clip(u, ± t) = u − soft(u, t),
+            dual ← dual + ρ(clip(c, ± threshold·weights) − dual),   clip(c, ± t) = c − soft(c, t),
 
         the proximal operator of the conjugate of threshold·‖weights · ‖₁ (Moreau), relaxed by ρ.
 
@@ -192,11 +219,24 @@ class SaraDictionary:
         self._workers.run(kernels.synthesise_finest, out, job)
         return out
 
-    def reweight(self, image, alpha, scale, out):
+    def reweight(self, image: np.ndarray, alpha: float | np.ndarray, scale: float | np.ndarray,
+                 out: np.ndarray) -> np.ndarray:
         """Fill `out`, an array of `coef_shape`, with the weights s·α/(α + d̄), d̄ what is around in Ψ† image.
 
         d̄ is the root mean square of a coefficient and its eight neighbours in the band (periodic).  `alpha` > 0 and
         `scale` s are one number per band, in the order of `bands`, or one for all.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        alpha, scale : float or float (number of bands,)
+            α > 0, in the unit of the coefficients, and s.
+        out : real coef_shape
+            Receives the weights.
+
+        Returns
+        -------
+        real coef_shape
         """
         out = self.analysis(image, self._checked(out, "out", self.coef_shape))
         params = np.empty((len(self._rectangles), 2), self.dtype)
@@ -206,8 +246,16 @@ class SaraDictionary:
         self._workers.run(neighbourhood_weights, out, self._rectangles, params, self._ring)
         return out
 
-    def scale_at(self, coefs, pixels, factor):
-        """Multiply the coefficients that describe some pixels, bool (nx, ny), and those beside them, in place."""
+    def scale_at(self, coefs: np.ndarray, pixels: np.ndarray, factor: float) -> None:
+        """Multiply the coefficients that describe some pixels, bool (nx, ny), and those beside them, in place.
+
+        Parameters
+        ----------
+        coefs : real coef_shape
+            Changed in place.
+        pixels : bool (nx, ny)
+        factor : float
+        """
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         plane = np.zeros(self.coef_shape[1:], bool)
         plane[:self.shape[0], :self.shape[1]] = pixels
@@ -262,8 +310,21 @@ def _approximations(padded, levels, itemsize):
     return sum((nx >> level) * kernels.padded_width(ny >> level, itemsize) for level in range(1, levels))
 
 
-def coefficient_bytes(shape, n_bases, levels, dtype=np.float32):
-    """Memory of one array of coefficients, and of the workspace of a dictionary, in bytes."""
+def coefficient_bytes(shape: tuple[int, int], n_bases: int, levels: int,
+                      dtype: npt.DTypeLike = np.float32) -> tuple[int, int]:
+    """Memory of one array of coefficients, and of the workspace of a dictionary, in bytes.
+
+    Parameters
+    ----------
+    shape : (int, int)
+        Pixels of the image.
+    n_bases, levels : int
+    dtype : float32 or float64
+
+    Returns
+    -------
+    int, int
+    """
     padded, size = _padded(shape, levels), np.dtype(dtype).itemsize
     return n_bases * padded[0] * padded[1] * size, n_bases * _approximations(padded, levels, size) * size
 
@@ -303,8 +364,18 @@ def _filters(wavelets, n_bases, dtype):
     return kernels.Filters(lengths, analysis.astype(dtype), synthesis.astype(dtype), dtype.type(gain))
 
 
-def filter_lengths(wavelets):
-    """Return the number of taps of each basis, int (b,), 0 for Dirac."""
+def filter_lengths(wavelets: Sequence[str]) -> np.ndarray:
+    """Return the number of taps of each basis, int (b,), 0 for Dirac.
+
+    Parameters
+    ----------
+    wavelets : sequence of str
+        Names of the bases, 'dirac' or those of PyWavelets.
+
+    Returns
+    -------
+    int64 (b,)
+    """
     return np.array([0 if name == "dirac" else pywt.Wavelet(name).dec_len for name in wavelets], np.int64)
 
 

@@ -12,32 +12,82 @@ from __future__ import annotations
 import functools
 
 import numpy as np
+import numpy.typing as npt
 from scipy.optimize import brentq
 from scipy.special import i0
 
 __all__ = ["alias_level", "gain", "kernel", "kernel_polynomial", "kernel_shape", "padding", "transform"]
 
 
-def kernel_shape(width, sigma):
-    """The shape β for `width` cells and a signal that fills 1/`sigma` of the band."""
+def kernel_shape(width: int, sigma: float) -> float:
+    """The shape β for `width` cells and a signal that fills 1/`sigma` of the band.
+
+    Parameters
+    ----------
+    width : int
+        Cells.
+    sigma : float
+        σ ≥ 1.
+
+    Returns
+    -------
+    float
+    """
     return np.pi * np.sqrt(max((width * (1 - 0.5 / sigma)) ** 2 - 0.8, 0.0))
 
 
-def kernel(t, beta):
-    """φ(t), zero outside [−1, 1]."""
+def kernel(t: np.ndarray, beta: float | np.ndarray) -> np.ndarray:
+    """φ(t), zero outside [−1, 1].
+
+    Parameters
+    ----------
+    t : real, any shape
+    beta : float
+        Shape β.
+
+    Returns
+    -------
+    real, of the shape of t
+    """
     return np.where(np.abs(t) <= 1, i0(beta * np.sqrt(np.maximum(1 - t**2, 0))), 0) / i0(beta)
 
 
-def transform(xi, width, beta):
-    """Fourier transform of φ(2x/width) at `xi` cycles per cell."""
+def transform(xi: npt.ArrayLike, width: int, beta: float) -> np.ndarray:
+    """Fourier transform of φ(2x/width) at `xi` cycles per cell.
+
+    Parameters
+    ----------
+    xi : real, any shape
+        Cycles per cell.
+    width : int
+        Cells.
+    beta : float
+        Shape β.
+
+    Returns
+    -------
+    float64, of the shape of xi
+    """
     square = beta**2 - (np.pi * width * np.asarray(xi, dtype=np.float64)) ** 2
     r = np.sqrt(np.abs(square))
     inside = np.sinh(np.where(square > 0, r, 0)) / np.where(r > 0, r, 1)
     return width * np.where(square > 0, inside, np.sinc(r / np.pi)) / i0(beta)
 
 
-def alias_level(width, sigma):
-    """Largest relative error of interpolation: root sum square of the aliases over the signal."""
+def alias_level(width: int, sigma: float) -> float:
+    """Largest relative error of interpolation: root sum square of the aliases over the signal.
+
+    Parameters
+    ----------
+    width : int
+        Cells.
+    sigma : float
+        The signal fills 1/σ of the band.
+
+    Returns
+    -------
+    float
+    """
     beta = kernel_shape(width, sigma)
     xi = np.linspace(0, 0.5 / sigma, 33)
     orders = np.concatenate([np.arange(-16, 0), np.arange(1, 17)])
@@ -45,15 +95,41 @@ def alias_level(width, sigma):
     return np.max(np.sqrt(np.sum(aliases**2, axis=1)) / transform(xi, width, beta))
 
 
-def gain(width, sigma):
-    """Largest ratio of the kernel's transform over the signal."""
+def gain(width: int, sigma: float) -> float:
+    """Largest ratio of the kernel's transform over the signal.
+
+    Parameters
+    ----------
+    width : int
+        Cells.
+    sigma : float
+        The signal fills 1/σ of the band.
+
+    Returns
+    -------
+    float
+    """
     ends = transform([0, 0.5 / sigma], width, kernel_shape(width, sigma))
     return ends[0] / ends[1]
 
 
 @functools.cache
-def padding(width, eps, low=1.1, high=4.0):
-    """Smallest σ ∈ [low, high] with which `width` cells reach the accuracy `eps`; inf if none does."""
+def padding(width: int, eps: float, low: float = 1.1, high: float = 4.0) -> float:
+    """Smallest σ ∈ [low, high] with which `width` cells reach the accuracy `eps`; inf if none does.
+
+    Parameters
+    ----------
+    width : int
+        Cells.
+    eps : float
+        Largest alias level.
+    low, high : float
+        Range of σ.
+
+    Returns
+    -------
+    float
+    """
     if alias_level(width, high) > eps:
         return np.inf
     if alias_level(width, low) <= eps:
@@ -61,8 +137,17 @@ def padding(width, eps, low=1.1, high=4.0):
     return brentq(lambda sigma: np.log(alias_level(width, sigma) / eps), low, high, xtol=1e-3)
 
 
-def kernel_polynomial(width, beta, degree):
+def kernel_polynomial(width: int, beta: float, degree: int) -> np.ndarray:
     """The kernel at its `width` cells as polynomials of the position within a cell.
+
+    Parameters
+    ----------
+    width : int
+        Cells.
+    beta : float
+        Shape β.
+    degree : int
+        Of the polynomials.
 
     Returns
     -------

@@ -15,13 +15,17 @@ transform; the blocks of the data are slices of its result.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.decimation import (
     AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable)
 from casa_sara.operators.nufft import NonUniformFFT, memory_size
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 
 __all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "check_cell", "check_field", "choose_eps", "grid_bytes", "share_of"]
 
@@ -66,7 +70,9 @@ class MeasurementOperator:
         For an argument out of these ranges, or a `cell` too large for the longest baseline.
     """
 
-    def __init__(self, uv, cell_rad, shape, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1, whole=None):
+    def __init__(self, uv: np.ndarray, cell_rad: npt.ArrayLike, shape: tuple[int, int],
+                 row_scale: np.ndarray | None = None, eps: float = 1e-6, dtype: npt.DTypeLike = np.float32,
+                 nthreads: int = 1, whole: tuple[int, npt.ArrayLike] | None = None) -> None:
         uv = np.asarray(uv, dtype=np.float64)
         if uv.ndim != 2 or uv.shape[0] != 2 or uv.shape[1] == 0 or not np.all(np.isfinite(uv)):
             raise ValueError(f"uv must be finite and of shape (2, M) with M >= 1, not {uv.shape}")
@@ -109,8 +115,19 @@ class MeasurementOperator:
         self._lines = np.zeros((counts[0], self.shape[1]), self.dtype)
         self._scratch = np.zeros(scratch_shape(self._columns, self.workers.count), self.dtype)
 
-    def forward(self, image, out=None):
-        """Return the visibilities Φ·image, complex (M,), of a real image (nx, ny), in `out` where given."""
+    def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the visibilities Φ·image, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         image = _checked(np.ascontiguousarray(image, self.dtype), "image", self.shape, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         _checked(out, "out", (self.size,), self.complex_dtype)
@@ -119,10 +136,20 @@ class MeasurementOperator:
         self._nufft.to_points(out)
         return out
 
-    def adjoint(self, vis, out=None):
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Return the real image Re(Φ†·vis), (nx, ny), of complex visibilities (M,), in `out` where given.
 
         It is the adjoint for real inner products: Re⟨Φx, y⟩ = ⟨x, adjoint(y)⟩.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
         """
         vis = _checked(np.ascontiguousarray(vis, self.complex_dtype), "vis", (self.size,), self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
@@ -136,16 +163,38 @@ class MeasurementOperator:
 class NoVisibilities:
     """The operator of a process that holds none: `forward` returns nothing, `adjoint` an empty image."""
 
-    def __init__(self, shape, dtype=np.float32, nthreads=1):
+    def __init__(self, shape: tuple[int, int], dtype: npt.DTypeLike = np.float32, nthreads: int = 1) -> None:
         self.shape, self.size, self.dtype = tuple(shape), 0, np.dtype(dtype)
         self.complex_dtype, self.workers = np.result_type(self.dtype, np.complex64), Workers(nthreads)
 
-    def forward(self, image, out=None):
-        """Return no visibilities."""
+    def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return no visibilities.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         return np.empty(0, self.complex_dtype) if out is None else out
 
-    def adjoint(self, vis, out=None):
-        """Return zeros (nx, ny), in `out` where given."""
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return zeros (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         out = np.empty(self.shape, self.dtype) if out is None else out
         out.fill(0)
         return out
@@ -154,18 +203,45 @@ class NoVisibilities:
 class Summed:
     """An operator whose visibilities are spread over the ranks of a communicator: `adjoint` is the sum of theirs."""
 
-    def __init__(self, measurement, comm):
+    def __init__(self, measurement: Any, comm: Serial) -> None:
         self._measurement, self._comm = measurement, comm
         self.shape, self.dtype, self.workers = measurement.shape, measurement.dtype, measurement.workers
         self.forward = measurement.forward
 
-    def adjoint(self, vis, out=None):
-        """Return the image of all visibilities, on every rank."""
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the image of all visibilities, on every rank.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            Of this rank.
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         return self._comm.sum(self._measurement.adjoint(vis, out))
 
 
-def share_of(uv, *arguments, comm=SERIAL, **options):
-    """Return the operator of this rank's visibilities; arguments and errors as of :class:`MeasurementOperator`."""
+def share_of(uv: np.ndarray, *arguments: Any, comm: Serial = SERIAL,
+             **options: Any) -> MeasurementOperator | NoVisibilities:
+    """Return the operator of this rank's visibilities; arguments and errors as of :class:`MeasurementOperator`.
+
+    Parameters
+    ----------
+    uv : float64 (2, M)
+        Baselines of this rank's visibilities in wavelengths; M may be 0.
+    *arguments, **options
+        As of :class:`MeasurementOperator`.
+    comm : casa_sara.parallel.Serial or MPI
+        Over whose ranks the visibilities are spread.
+
+    Returns
+    -------
+    MeasurementOperator or NoVisibilities
+    """
     if comm.size == 1:
         return MeasurementOperator(uv, *arguments, **options)
     reach = [comm.largest(float(np.abs(axis).max(initial=0))) for axis in uv]
@@ -175,8 +251,16 @@ def share_of(uv, *arguments, comm=SERIAL, **options):
     return NoVisibilities(arguments[1], nthreads=options.get("nthreads", 1))
 
 
-def check_cell(uv, cell_rad):
-    """Raise ValueError unless pixels of `cell_rad` (one number, or one per axis) sample the fringes of uv (2, M)."""
+def check_cell(uv: np.ndarray, cell_rad: float | tuple[float, float] | np.ndarray) -> None:
+    """Raise ValueError unless pixels of `cell_rad` (one number, or one per axis) sample the fringes of uv (2, M).
+
+    Parameters
+    ----------
+    uv : float64 (2, M)
+        Baselines in wavelengths.
+    cell_rad : float or (float, float)
+        Pixel size in radians.
+    """
     cell = np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))
     if not np.all(cell > 0):
         raise ValueError(f"cell={cell_rad} must be positive, in radians")
@@ -187,8 +271,18 @@ def check_cell(uv, cell_rad):
                          f"{longest.max() / 1e3:.4g} klambda: use at most cell={0.999 * largest:.4g}arcsec")
 
 
-def check_field(longest, shape, cell_rad):
-    """Raise ValueError unless the image is as wide as the fringe of the longest baseline, in wavelengths."""
+def check_field(longest: float, shape: tuple[int, int], cell_rad: tuple[float, float]) -> None:
+    """Raise ValueError unless the image is as wide as the fringe of the longest baseline, in wavelengths.
+
+    Parameters
+    ----------
+    longest : float
+        Longest baseline in wavelengths.
+    shape : (int, int)
+        Pixels of the image.
+    cell_rad : (float, float)
+        Pixel size in radians.
+    """
     width = min(n * cell for n, cell in zip(shape, cell_rad))
     if width * longest < 1:
         cells = [f"{cell * ARCSEC_PER_RAD:.4g}arcsec" for cell in cell_rad]
@@ -202,7 +296,8 @@ def _decimations(shape, reach, eps, dtype):
     return [AxisDecimation(size, band, eps, precision) for size, band in zip(shape, bands)]
 
 
-def grid_bytes(size, reach, shape, eps=1e-6, dtype=np.float32):
+def grid_bytes(size: int, reach: Sequence[float], shape: tuple[int, int], eps: float = 1e-6,
+               dtype: npt.DTypeLike = np.float32) -> int:
     """Memory of an operator but for what it keeps of each visibility: its grid, and the decimated image.
 
     Parameters
@@ -236,7 +331,8 @@ def _checked(array, name, shape, dtype):
     return array
 
 
-def choose_eps(vis, weight, dtype=np.float32, comm=SERIAL):
+def choose_eps(vis: np.ndarray, weight: np.ndarray, dtype: npt.DTypeLike = np.float32,
+               comm: Serial = SERIAL) -> float:
     """Return the accuracy at which the operator's errors are far below the noise of the image.
 
     The errors in the naturally weighted dirty image are below eps times its peak, in practice a tenth of that; the

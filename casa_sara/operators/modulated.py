@@ -12,7 +12,10 @@ and the images T_k(s)·x stay real.  About as many terms are needed as c has rad
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 from scipy.special import iv, jv
 
@@ -42,7 +45,8 @@ class ModulatedOperator:
     turning : bool
     """
 
-    def __init__(self, base, place, factors, rotation=None, turning=False):
+    def __init__(self, base: Any, place: np.ndarray, factors: np.ndarray, rotation: np.ndarray | None = None,
+                 turning: bool = False) -> None:
         self.shape, self.size, self.dtype, self.complex_dtype = base.shape, base.size, base.dtype, base.complex_dtype
         self.workers = base.workers
         self._base, self._place, self._factors = base, place, factors
@@ -51,8 +55,19 @@ class ModulatedOperator:
         self._polynomial, self._previous, self._image = (np.empty(self.shape, self.dtype) for _ in range(3))
         self._vis = np.empty(self.size, self.complex_dtype)
 
-    def forward(self, image, out=None):
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
+    def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         image = np.ascontiguousarray(image, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         if image.shape != self.shape or out.shape != (self.size,) or out.dtype != self.complex_dtype:
@@ -66,8 +81,19 @@ class ModulatedOperator:
         run(_rotate, self._rotation, out)
         return out
 
-    def adjoint(self, vis, out=None):
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,).
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         vis = np.ascontiguousarray(vis, self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
         if vis.shape != (self.size,) or out.shape != self.shape or out.dtype != self.dtype:
@@ -81,14 +107,29 @@ class ModulatedOperator:
         return out
 
 
-def terms_needed(largest, eps, modified=False):
-    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`: the rest is below eps for |c| ≤ largest."""
+def terms_needed(largest: float, eps: float, modified: bool = False) -> int:
+    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`: the rest is below eps for |c| ≤ largest.
+
+    Parameters
+    ----------
+    largest : float
+        Largest |c|.
+    eps : float
+        Largest rest of the series.
+    modified : bool
+        Of exp(c s) instead of exp(i c s).
+
+    Returns
+    -------
+    int
+    """
     rest = 2 * (iv if modified else jv)(np.arange(MOST), largest)
     rest = np.cumsum(np.abs(rest)[::-1])[::-1]  # of the orders from k on
     return max(1, int(np.count_nonzero(rest > eps)))
 
 
-def bessel_factors(argument, count, modified=False, dtype=np.float32):
+def bessel_factors(argument: np.ndarray, count: int, modified: bool = False,
+                   dtype: npt.DTypeLike = np.float32) -> np.ndarray:
     """Return (2 − δ_k0) J_k(c), or I_k(c) if `modified`, for the orders k < count.
 
     The two highest orders are summed from their power series, the others follow by recurrence downwards, which is stable.

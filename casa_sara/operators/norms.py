@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import eigh_tridiagonal
 
 __all__ = ["power_method"]
 
 
-def power_method(apply, shape, dtype=np.float64, tol=0.01, max_iter=200, seed=0):
+def power_method(apply: Callable[[np.ndarray], np.ndarray], shape: tuple[int, ...], dtype: npt.DTypeLike = np.float64,
+                 tol: float = 0.01, max_iter: int = 200, seed: int = 0) -> float:
     """Return ‖A‖², from above, given `apply`, which maps an image x to A†A x.
 
     Lanczos iterations, which need a fraction of the calls of plain powers.  θ, the largest eigenvalue of A†A on the

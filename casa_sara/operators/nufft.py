@@ -17,15 +17,18 @@ of threads.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import scipy.fft
 from numba import njit
 
 from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import (
     gather_rows, multiply, pair_sums, polynomials, scale_pairs, scatter_rows, second_half_twice)
+from casa_sara.operators._workers import Workers
 
 __all__ = ["NonUniformFFT", "memory_size"]
 
@@ -57,7 +60,8 @@ class NonUniformFFT:
         For how many points the plan is made, M unless given.
     """
 
-    def __init__(self, frequencies, scales, starts, counts, eps, dtype, workers, n_points=None):
+    def __init__(self, frequencies: np.ndarray, scales: np.ndarray, starts: Sequence[int], counts: Sequence[int],
+                 eps: float, dtype: npt.DTypeLike, workers: Workers, n_points: int | None = None) -> None:
         self._workers = workers
         width, sigma, self._lengths = _least_work(n_points or frequencies.shape[1], starts, counts, eps, dtype)
         beta = kaiser_bessel.kernel_shape(width, sigma)
@@ -110,12 +114,18 @@ class NonUniformFFT:
         parts = inner[: starts[0] + counts[0]], inner[len(inner) + starts[0] :]
         self._filled = [part for part in parts if part.size]
 
-    def clear(self):
+    def clear(self) -> None:
         """Fill the grid with zeros."""
         self._workers.run(_clear, self._cells)
 
-    def to_points(self, out):
-        """Transform the samples in `grid` into `out`, contiguous complex (M,)."""
+    def to_points(self, out: np.ndarray) -> None:
+        """Transform the samples in `grid` into `out`, contiguous complex (M,).
+
+        Parameters
+        ----------
+        out : complex (M,)
+            Receives the values, in the order of the points as they were given.
+        """
         for part in self._filled:
             self._fft(part, 1, scipy.fft.ifft)
         used, halo, length = self.grid[:, self._used], self._halo, self._lengths[0]
@@ -124,8 +134,14 @@ class NonUniformFFT:
         used[length + halo :] = used[halo : 2 * halo]
         self._workers.run(_interpolate, self._memory, self._stride, self._points, self._kernel, _real_pairs(out))
 
-    def from_points(self, values):
-        """Transpose of `to_points`, from `values`, contiguous complex (M,)."""
+    def from_points(self, values: np.ndarray) -> None:
+        """Transpose of `to_points`, from `values`, contiguous complex (M,).
+
+        Parameters
+        ----------
+        values : complex (M,)
+            In the order of the points as they were given.
+        """
         self.clear()
         self._workers.run(_spread, self._memory, self._stride, self._points, self._kernel, self._pieces,
                           _real_pairs(values))
@@ -186,8 +202,23 @@ def _pieces(n_points):
     return int(min(MOST_PIECES, max(1, n_points // PIECE_POINTS)))
 
 
-def memory_size(n_points, starts, counts, eps, dtype):
-    """Number of reals in the grid and the pieces, at most: these hold disjoint tiles of the rows, but for a halo each."""
+def memory_size(n_points: int, starts: Sequence[int], counts: Sequence[int], eps: float, dtype: npt.DTypeLike) -> int:
+    """Number of reals in the grid and the pieces, at most: these hold disjoint tiles of the rows, but for a halo each.
+
+    Parameters
+    ----------
+    n_points : int
+        Number of points M.
+    starts, counts : (int, int)
+        First sample and number of samples along both axes.
+    eps : float
+        Accuracy.
+    dtype : float32 or float64
+
+    Returns
+    -------
+    int
+    """
     width, _, lengths = _least_work(n_points, starts, counts, eps, dtype)
     height = lengths[0] + 2 * (width // 2 + 1)
     more = _pieces(n_points) - 1

@@ -11,14 +11,16 @@ the image is that at ν0.  One α for the whole image is a factor on each sample
 from __future__ import annotations
 
 from math import prod
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from casa_sara.operators.measurement import SMALLEST_EPS, NoVisibilities, share_of
+from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, NoVisibilities, share_of
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
-from casa_sara.operators.widefield import WTerm, w_operator
-from casa_sara.options import LARGEST_INDEX
-from casa_sara.parallel import SERIAL
+from casa_sara.operators.widefield import WGridder, WTerm, w_operator
+from casa_sara.options import LARGEST_INDEX, ImageGrid
+from casa_sara.parallel import SERIAL, Serial
 
 __all__ = ["further_bytes", "sky_operator"]
 
@@ -27,7 +29,10 @@ SERIES_SAMPLE, SERIES_PIXEL = 16, 16  # rotation and one term; place, two polyno
 GRIDDER_SAMPLE, GRIDDER_PIXEL = 80, 80  # what it holds, and the grids and indices of a call
 
 
-def sky_operator(uvw, grid, freq_hz=None, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1, comm=SERIAL):
+def sky_operator(uvw: np.ndarray, grid: ImageGrid, freq_hz: np.ndarray | None = None,
+                 row_scale: np.ndarray | None = None, eps: float = 1e-6, dtype: npt.DTypeLike = np.float32,
+                 nthreads: int = 1,
+                 comm: Serial = SERIAL) -> MeasurementOperator | ModulatedOperator | WGridder | NoVisibilities:
     """Return the measurement operator of an image.
 
     Parameters
@@ -78,7 +83,7 @@ def _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm):
     return w_operator(uvw, grid.cell_rad, grid.shape, row_scale, eps, dtype, nthreads)
 
 
-def further_bytes(samples, grid, max_w=0.0, band=0.0, eps=1e-6):
+def further_bytes(samples: int, grid: Any, max_w: float = 0.0, band: float = 0.0, eps: float = 1e-6) -> int:
     """Memory of the operator beyond that of the plain one, in single precision.
 
     Parameters

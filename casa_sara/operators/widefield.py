@@ -9,9 +9,11 @@ series grows with the largest phase, which therefore decides: `WTerm`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, check_cell
@@ -44,8 +46,24 @@ class WTerm:
     terms: int
 
     @classmethod
-    def of(cls, max_w, shape, cell_rad, eps):
-        """The way that takes least for |w| ≤ max_w, in wavelengths, an image and an accuracy."""
+    def of(cls, max_w: float, shape: tuple[int, int], cell_rad: Sequence[float] | np.ndarray, eps: float) -> WTerm:
+        """The way that takes least for |w| ≤ max_w, in wavelengths, an image and an accuracy.
+
+        Parameters
+        ----------
+        max_w : float
+            Largest |w| in wavelengths.
+        shape : (int, int)
+            Pixels of the image.
+        cell_rad : (float, float)
+            Pixel size in radians.
+        eps : float
+            Accuracy.
+
+        Returns
+        -------
+        WTerm
+        """
         depth = -float(_n_minus_1(*_cosines(shape, cell_rad, corners=True)).min())
         phase = 2 * np.pi * float(max_w) * depth
         terms = terms_needed(phase / 2, eps / 4)
@@ -58,7 +76,9 @@ class WTerm:
         return f"w-term: changes phases by up to {self.phase:.3g} rad in this image, modelled by {way}"
 
 
-def w_operator(uvw, cell_rad, shape, row_scale=None, eps=1e-6, dtype=np.float32, nthreads=1):
+def w_operator(uvw: np.ndarray, cell_rad: npt.ArrayLike, shape: tuple[int, int],
+               row_scale: np.ndarray | None = None, eps: float = 1e-6, dtype: npt.DTypeLike = np.float32,
+               nthreads: int = 1) -> ModulatedOperator | WGridder:
     """Return the measurement operator with the w-term.
 
     Parameters
@@ -120,7 +140,8 @@ class WGridder:
         As of :func:`w_operator`.
     """
 
-    def __init__(self, uvw, cell_rad, shape, row_scale, eps, dtype, nthreads):
+    def __init__(self, uvw: np.ndarray, cell_rad: Sequence[float] | np.ndarray, shape: tuple[int, int],
+                 row_scale: np.ndarray | None, eps: float, dtype: npt.DTypeLike, nthreads: int) -> None:
         from ducc0 import wgridder  # only where it is needed
 
         check_cell(uvw[:2], cell_rad)
@@ -141,8 +162,19 @@ class WGridder:
                                         for side, n in zip(sides, self.shape))]
         self._vis = np.empty((self.size, 1), np.result_type(precise, np.complex64))
 
-    def forward(self, image, out=None):
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
+    def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+        out : complex (M,), optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         if np.shape(image) != self.shape:
             raise ValueError(f"image must be of shape {self.shape}")
         out = np.empty(self.size, self.complex_dtype) if out is None else out
@@ -152,8 +184,19 @@ class WGridder:
         out[...] = self._vis[:, 0]
         return out
 
-    def adjoint(self, vis, out=None):
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,).
+
+        Parameters
+        ----------
+        vis : complex (M,)
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         if np.shape(vis) != (self.size,):
             raise ValueError(f"vis must be of shape ({self.size},)")
         out = np.empty(self.shape, self.dtype) if out is None else out

@@ -8,7 +8,7 @@ _jit = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "arcp", "ns
 
 @_jit
 def data_step(dual, phi_bar, phi_anchor, vis, precond, pieces, multipliers, relaxation, norms_sq, worker, workers):
-    """v ← v + ρ(ṽ − v), ṽ = U(s − z) = λ(v + U(Φx̄ − y))/(U + λ), and with x̄ = 2x − z replace Φz by that of z + ρ(x − z).
+    """v ← v + ρ(ṽ − v), ṽ = λ(v + U(Φx̄ − y))/(U + λ), and Φz by that of z + ρ(x − z): Φx = ½(Φx̄ + Φz).
 
     Visibilities are real pairs (M, 2), `precond` is U (M,), λ the block's multiplier. Each row of `pieces` is the first
     sample, the last + 1 and the block of a piece, whose ‖y − Φx‖² goes to `norms_sq`.
@@ -32,7 +32,7 @@ def data_step(dual, phi_bar, phi_anchor, vis, precond, pieces, multipliers, rela
 
 @_jit
 def shifted_norms(dual, phi_bar, vis, precond, multiplier, start, stop):
-    """Return n² = ‖z − y‖² and −½ d(n²)/dλ for z − y = U(s − y)/(U + λ), s = U⁻¹v + Φx̄."""
+    """Return n² = ‖q − y‖² and −½ d(n²)/dλ for q − y = U(s − y)/(U + λ), s = U⁻¹v + Φx̄."""
     norm_sq = 0.0
     slope = 0.0
     for m in range(start, stop):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 from casa_sara.solver import _kernels as kernels
+from casa_sara.solver.interfaces import Measurement, Prior
 from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.prox import ellipsoid_multiplier
 from casa_sara.solver.statefile import fill
@@ -13,11 +17,15 @@ from casa_sara.solver.statefile import fill
 __all__ = ["BASIS_ARRAYS", "SAMPLE_ARRAYS", "AdaptivePPD"]
 
 RELAXATION = 1.8
+# τ: the iteration converges for τ(η‖U^½Φ‖² + ζ‖Ψ‖²) < 1, at any 0 < ρ < 2 (Condat 2013). With η = 1/‖U^½Φ‖² and
+# ζ = 1/‖Ψ‖² the bracket is 2, or less where a norm is known from above only. The paper gives no number; this is 1 %
+# below the limit.
+STEP = 0.495
 PIECE = 4096  # samples of a block that one thread works on: sums are the same for any number of threads
 STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor",
                 "multipliers", "residual_norms")
 SAMPLE_ARRAYS, BASIS_ARRAYS = ("l2_dual", "_phi_anchor"), ("l1_dual", "l1_weights")  # where ranks differ
-STATE_VALUES = ("threshold", "rel_change", "iteration")
+STATE_VALUES = ("threshold", "rel_change", "iteration", "constrained")
 
 
 class AdaptivePPD:
@@ -26,7 +34,7 @@ class AdaptivePPD:
     One call of :meth:`step` is one pass through Algorithm 1 (step numbers of the paper):
 
     ====  ==========================================================================
-    5     v_j ← U_j(1 − U_j^{−½} P_{E_j} )(U_j⁻¹v_j + Φ_j x̄) = λ_j (z_j − y_j)
+    5     v_j ← U_j(s_j − q_j) = λ_j(q_j − y_j),  s_j = U_j⁻¹v_j + Φ_j x̄,  q_j = P_{E_j}(s_j)
     6     μ_j = ‖y_j − Φ_j x‖
     13    u ← (1 − S_{κW})(u + Ψ†x̄) = clip(u + Ψ†x̄, ±κW)
     17    x ← P_{R+}(x − τ(η Φ†v + ζ Ψu)),  ζ = 1/‖Ψ‖² = 1
@@ -34,14 +42,24 @@ class AdaptivePPD:
     19    σ = ‖x − x_prev‖ / ‖x‖
     ====  ==========================================================================
 
-    Steps 5, 13 and 17 are over-relaxed: v ← v + ρ(ṽ − v), u ← u + ρ(ũ − u) with ṽ, ũ what the table says, and the
-    image's step starts from z ← z + ρ(x − z), so that x̄ = 2x − z.  ρ = 1 is the table itself (z = x_prev); any
-    0 < ρ < 2 has the same fixed points and converges under the same condition on the steps (Condat 2013).
+    Steps 7–10, by which the bounds ε_j move, need μ_j and σ and come after :meth:`step`: they are `adapt` of
+    :class:`casa_sara.solver.l2_bounds.AdaptiveBounds` and of :class:`casa_sara.solver.dabbech2018.PaperBounds`.
 
-    The projection onto the ellipsoid of block j is z_j − y_j = U(s_j − y_j)/(U + λ_j).  Either its radius, the
-    bound ε_j, is given and the multiplier λ_j follows from ‖z_j − y_j‖ = ε_j (:attr:`l2_bounds`), or the
-    multiplier is given (:attr:`multipliers`) and the bound is the radius that belongs to it: see
+    Steps 5, 13 and 17 are over-relaxed: v ← v + ρ(ṽ − v), u ← u + ρ(ũ − u) with ṽ, ũ what the table says, and the
+    image's step starts from the anchor z ← z + ρ(x − z), so that x̄ = 2x − z.  ρ = 1 is the table itself (z = x_prev);
+    any 0 < ρ < 2 has the same fixed points and converges under the same condition on the steps (Condat 2013).
+
+    Step 6 needs Φx, but one Φ per iteration is enough: from x̄ = 2x − z follows Φx = ½(Φx̄ + Φz), and Φz follows z by
+    Φz ← Φz + ρ(Φx − Φz).
+
+    The projection in the metric U onto the ellipsoid of block j is q_j − y_j = U(s_j − y_j)/(U + λ_j).  Either its
+    radius, the bound ε_j, is given and the multiplier λ_j follows from ‖q_j − y_j‖ = ε_j (:meth:`constrain`), or the
+    multiplier is given and the bound is the radius that belongs to it (:meth:`penalise`): see
     :mod:`casa_sara.solver.l2_bounds` for how a noise level fixes a multiplier.
+
+    The weights W stand in the threshold κW of Step 13, with u the dual variable of Ψ†x.  The paper has them in the
+    operator WΨ†, with u that of WΨ†x; the problem is the same.  Here ‖Ψ‖ = 1 whatever the weights are, so that neither
+    the steps nor the meaning of u change when the weights do.
 
     Parameters
     ----------
@@ -74,6 +92,8 @@ class AdaptivePPD:
         x and x̄.
     anchor : real (nx, ny)
         z.
+    tau, l2_step : float
+        τ, and η = 1/`data_norm_sq`.
     lowest : real (nx, ny)
         Least value of each pixel: 0, or −∞ without positivity and for pixels of `points`; +∞ for pixels that stay 0, see
         :meth:`confine`.
@@ -84,7 +104,13 @@ class AdaptivePPD:
     l1_dual, l2_dual
         u and v.
     l1_weights
-        W, or None for ones.
+        W, ones at the beginning.
+    multipliers : float (d,)
+        λ_j.
+    l2_bounds : float (d,)
+        ε_j of :meth:`constrain`.
+    constrained : bool
+        Whether the bounds are given and Step 5 finds the multipliers, or the multipliers are.
     threshold : float
         κ, in the unit of the model: only the speed depends on it, but see :meth:`rescale`.
     residual_norms : float (d,)
@@ -97,23 +123,26 @@ class AdaptivePPD:
         Jy/pixel in the unit of the model, for the record.
     """
 
-    def __init__(self, measurement, dictionary, vis, offsets, precond, data_norm_sq, positivity=True,
-                 relaxation=RELAXATION, comm=SERIAL):
-        self.measurement, self.dictionary, self.comm = measurement, dictionary, comm
+    def __init__(self, measurement: Measurement, dictionary: Prior, vis: np.ndarray, offsets: np.ndarray,
+                 precond: np.ndarray, data_norm_sq: float, positivity: bool = True, relaxation: float = RELAXATION,
+                 comm: Serial = SERIAL) -> None:
+        self.measurement, self.comm = measurement, comm
+        self.dictionary: Any = dictionary  # Algorithm 2 of either method asks for more than a step does
         self.vis, self.precond, self.offsets = vis, precond, np.asarray(offsets)
         self.relaxation, self.positivity = relaxation, positivity
-        self.confined_to, self.points = None, PointSources()
-        self.tau, self.l2_step = 0.495, 1.0 / data_norm_sq
+        self.confined_to: np.ndarray | None = None
+        self.points = PointSources()
+        self.tau, self.l2_step = STEP, 1.0 / data_norm_sq
         dtype = vis.real.dtype
         self.model, self.anchor, self.model_bar, self.lowest = comm.images(4, measurement.shape, dtype)
         self.lowest[...] = 0 if positivity else -np.inf
         self._data_gradient, self._slots = np.zeros(measurement.shape, dtype), comm.slots(measurement.shape, dtype)
         self._prior_gradient = self._slots[comm.rank] if self._slots else np.zeros(measurement.shape, dtype)
         self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
-        self.l1_dual, self.l1_weights = dictionary.allocate(), None
+        self.l1_dual, self.l1_weights = dictionary.allocate(), dictionary.allocate()
+        self.l1_weights[...] = 1
         self.threshold = 0.0
-        self.multipliers = np.zeros(self.n_blocks)
-        self.l2_bounds = None
+        self.multipliers, self.l2_bounds, self.constrained = np.zeros(self.n_blocks), np.zeros(self.n_blocks), False
         self.begins, self.block_sizes = comm.place(np.diff(self.offsets))
         self.residual_norms = comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()]))
         self._pieces = np.array([(a, min(a + PIECE, stop), j) for j, (start, stop) in enumerate(self.blocks())
@@ -126,34 +155,44 @@ class AdaptivePPD:
         self.unit_jy = 1.0
 
     @property
-    def scratch_vis(self):
+    def scratch_vis(self) -> np.ndarray:
         """Work space between the steps, complex (M,); each step overwrites it."""
         return self._phi_bar
 
     @property
-    def scratch_image(self):
+    def scratch_image(self) -> np.ndarray:
         """Work space between the steps, real (nx, ny); each step overwrites it."""
         return self._data_gradient
 
     @property
-    def n_blocks(self):
+    def n_blocks(self) -> int:
         """Number of data blocks d."""
         return len(self.offsets) - 1
 
-    def blocks(self):
+    def blocks(self) -> Iterator[tuple[int, int]]:
         """Yield (start, stop) of every block."""
         return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
-    def confine(self, support):
-        """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}."""
+    def confine(self, support: np.ndarray) -> None:
+        """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}.
+
+        Parameters
+        ----------
+        support : bool (nx, ny)
+        """
         self.confined_to = support
         self.lowest[~support] = np.inf
         self.comm.settle()
 
-    def support_only(self, support, points=PointSources()):
+    def support_only(self, support: np.ndarray, points: PointSources = PointSources()) -> None:
         """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again.
 
         At `points`, which the support holds, it is free in its flux only.
+
+        Parameters
+        ----------
+        support : bool (nx, ny)
+        points : PointSources
         """
         if self.confined_to is not None:
             support = support & self.confined_to
@@ -166,33 +205,82 @@ class AdaptivePPD:
         self.points = points
         self.comm.settle()
 
-    def start_from(self, model):
-        """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay."""
+    def start_from(self, model: np.ndarray) -> None:
+        """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay.
+
+        Parameters
+        ----------
+        model : real (nx, ny)
+            In the unit of the iteration.
+        """
         for image in (self.model, self.anchor, self.model_bar):
             image[...] = model  # ranks of one machine write the same
             image[self.lowest == np.inf] = 0
         self.comm.settle()
         self.measurement.forward(self.model, self._phi_anchor)
 
-    def step(self):
-        """Do one iteration."""
-        points_before = self.points.values(self.model)
-        # Steps 5–6: data
+    def constrain(self, l2_bounds: np.ndarray) -> None:
+        """From now on, keep every block within its bound ε_j, float (d,): Step 5 finds the multipliers.
+
+        Parameters
+        ----------
+        l2_bounds : float (d,)
+            ε_j > 0, whitened.
+        """
+        self.l2_bounds, self.constrained = l2_bounds, True
+
+    def penalise(self, multipliers: np.ndarray) -> None:
+        """From now on, give every block the multiplier λ_j, float (d,); its bound is what follows from it.
+
+        Parameters
+        ----------
+        multipliers : float (d,)
+            λ_j ≥ 0.
+        """
+        self.multipliers[:], self.constrained = multipliers, False
+
+    def step(self) -> None:
+        """Do one iteration; Steps 7–10, the bounds, are taken after it."""
+        summed_norms_sq = self._update_data_dual()  # Steps 5–6
+        self._update_prior_dual()  # Step 13
+        self._update_image()  # Steps 17–19
+        np.sqrt(summed_norms_sq(), out=self.residual_norms)
+        self.iteration += 1
+
+    def _update_data_dual(self):
+        """Steps 5–6: v from Φx̄, its gradient Φ†v, and μ_j²; return what waits for its sum over the ranks."""
         self.measurement.forward(self.model_bar, self._phi_bar)
-        self._data_step()
-        norms_sq = self.comm.start_sum(self._norms_sq)
+        if self.constrained:
+            self._update_multipliers()
+        pairs = [vis.view(self.precond.dtype).reshape(-1, 2)
+                 for vis in (self.l2_dual, self._phi_bar, self._phi_anchor, self.vis)]
+        self.measurement.workers.run(kernels.data_step, *pairs, self.precond, self._pieces, self.multipliers,
+                                     self.precond.dtype.type(self.relaxation), self._piece_norms_sq)
+        self._norms_sq[:] = np.bincount(self._pieces[:, 2], self._piece_norms_sq, self.n_blocks)
+        summed_norms_sq = self.comm.start_sum(self._norms_sq)
         self.measurement.adjoint(self.l2_dual, self._data_gradient)
-        # Step 13: prior
+        return summed_norms_sq
+
+    def _update_multipliers(self):
+        """P_{E_j} of Step 5: the λ_j for which ‖q_j − y_j‖ = ε_j, from those of the iteration before."""
+        for j, (start, stop) in enumerate(self.blocks()):
+            self.multipliers[j] = ellipsoid_multiplier(
+                self.l2_dual, self._phi_bar, self.vis, self.precond, self.l2_bounds[j], self.multipliers[j],
+                start, stop, comm=self.comm)
+
+    def _update_prior_dual(self):
+        """Step 13: u from Ψ†x̄, and its gradient Ψu."""
         self.dictionary.dual_step(self.model_bar, self.l1_dual, self.threshold, self.l1_weights, self._prior_gradient,
                                   self.relaxation)
-        # Steps 17–19: image
-        dtype = self.model.dtype.type
-        steps = dtype(self.tau), dtype(self.l2_step), dtype(self.relaxation)
-        gradients, steps = self._summed_gradients(steps)
+
+    def _update_image(self):
+        """Steps 17–19: z, x and x̄ from the gradients, and σ."""
+        points_before = self.points.values(self.model)
+        real = self.model.dtype.type
+        gradients, steps = self._summed_gradients((real(self.tau), real(self.l2_step), real(self.relaxation)))
         self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, *gradients, steps,
                                      self.lowest, self._sums, part=self.comm.part)
         self.comm.settle()
-        np.sqrt(norms_sq(), out=self.residual_norms)
         sums, greatest = self._sums[:, :3].sum(axis=0), self._sums[:, 3].max()
         if len(self.points):
             if self.comm.part[0] == 0:
@@ -202,19 +290,6 @@ class AdaptivePPD:
         sums = [*sums.tolist(), float(greatest)]
         change, norm, self.model_flux, self.model_max = self.comm.lead(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
-        self.iteration += 1
-
-    def _data_step(self):
-        if self.l2_bounds is not None:
-            args = self.l2_dual, self._phi_bar, self.vis, self.precond
-            for j, (start, stop) in enumerate(self.blocks()):
-                self.multipliers[j] = ellipsoid_multiplier(*args, self.l2_bounds[j], self.multipliers[j], start, stop,
-                                                           comm=self.comm)
-        pairs = [vis.view(self.precond.dtype).reshape(-1, 2)
-                 for vis in (self.l2_dual, self._phi_bar, self._phi_anchor, self.vis)]
-        self.measurement.workers.run(kernels.data_step, *pairs, self.precond, self._pieces, self.multipliers,
-                                     self.precond.dtype.type(self.relaxation), self._piece_norms_sq)
-        self._norms_sq[:] = np.bincount(self._pieces[:, 2], self._piece_norms_sq, self.n_blocks)
 
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.
@@ -236,14 +311,31 @@ class AdaptivePPD:
             run(kernels.add_scaled, other, first, real(1), part=self.comm.part)
         return (first, last), (steps[0], real(1), steps[2])
 
-    def adjoint(self, vis, out=None):
-        """Return Φ†·vis of the samples of all ranks."""
+    def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Return Φ†·vis of the samples of all ranks.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            Whitened, of this rank.
+        out : real (nx, ny), optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         return self.comm.sum(self.measurement.adjoint(vis, out))
 
-    def rescale(self, threshold):
+    def rescale(self, threshold: float) -> None:
         """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.
 
         The saddle point of (κ, λ, u, v) and that of the same times a factor have the same image x.
+
+        Parameters
+        ----------
+        threshold : float
+            κ ≥ 0, in the unit of the model.
         """
         if self.threshold > 0:
             factor = threshold / self.threshold
@@ -252,7 +344,7 @@ class AdaptivePPD:
             self.multipliers *= factor
         self.threshold = float(threshold)
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return all that the next step depends on, beside the constructor's arguments.
 
         Returns
@@ -264,14 +356,12 @@ class AdaptivePPD:
         values = {name: getattr(self, name) for name in STATE_VALUES}
         return arrays | values | dict(l2_bounds=self.l2_bounds, points=self.points.places)
 
-    def set_state(self, state):
+    def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned, by copies."""
-        if self.l1_weights is None:
-            self.l1_weights = self.dictionary.allocate()
         for name in STATE_ARRAYS:
             fill(getattr(self, name), state[name])
         self.comm.settle()
         for name in STATE_VALUES:
             setattr(self, name, state[name])
-        self.l2_bounds = None if state["l2_bounds"] is None else np.array(state["l2_bounds"])
+        self.l2_bounds = np.array(state["l2_bounds"])
         self.points = PointSources(state["points"])

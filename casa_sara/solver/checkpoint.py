@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -39,12 +41,16 @@ class Checkpoint:
         The file holds a state of this run.
     """
 
-    def __init__(self, path, version, parameters, tell=lambda line: None, warn=lambda line: None):
+    def __init__(self, path: str, version: str, parameters: dict[str, Any],
+                 tell: Callable[[str], None] = lambda line: None,
+                 warn: Callable[[str], None] = lambda line: None) -> None:
         self.path, self.tell, self.warn = path, tell, warn
         self._header = dict(version=version, parameters=json.loads(json.dumps(parameters)), data={})
-        self.state, self._found, self._due, self.stands = None, None, 0.0, False
+        self.state: dict[str, Any] | None = None
+        self._found: dict[str, Any] = {}
+        self._due, self.stands = 0.0, False
 
-    def open(self):
+    def open(self) -> None:
         """Read the file into `state`.
 
         Raises
@@ -63,7 +69,7 @@ class Checkpoint:
         except CheckpointError as error:
             raise self.refusal(error) from None
 
-    def identify(self, **data):
+    def identify(self, **data: np.ndarray | str | None) -> None:
         """Identify the data, by arrays, their digests or None, and compare them with those of the file that was read.
 
         Raises
@@ -81,7 +87,7 @@ class Checkpoint:
                 raise self.refusal(f"it is of other data: {', '.join(different)} differ")
 
     @contextmanager
-    def applied(self, read=True):
+    def applied(self, read: bool = True) -> Iterator[dict[str, Any] | None]:
         """Yield `state` to be restored; an error meanwhile means that it does not fit. Afterwards it is released.
 
         With `read` = False it was another rank that has read it, and says so.
@@ -98,14 +104,23 @@ class Checkpoint:
         self.tell(f"continuing from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
         self.state = None
 
-    def due(self, now=False):
+    def due(self, now: bool = False) -> bool:
         """Return whether it is time to write, as it is whenever it has to be `now`."""
         return now or time.monotonic() >= self._due
 
-    def keep(self, make_state, iteration, now=False):
+    def keep(self, make_state: Callable[[], dict[str, Any]], iteration: int, now: bool = False) -> None:
         """Write `make_state()` when it is time, or `now`.
 
         What a full disk, or the like, prevents is said in the log and tried again: the run matters more.
+
+        Parameters
+        ----------
+        make_state : callable
+            Returns the state: dict of dicts, plain values and C-contiguous arrays.
+        iteration : int
+            Of the state.
+        now : bool
+            Write whatever the time.
         """
         begun = time.monotonic()
         if not self.due(now):
@@ -120,7 +135,7 @@ class Checkpoint:
         done = time.monotonic()
         self._due = done + max(INTERVAL, PATIENCE * (done - begun))
 
-    def remove(self):
+    def remove(self) -> None:
         """Remove the file, and what an interrupted write has left."""
         for path in (self.path, self.path + NEW):
             if os.path.lexists(path):
@@ -135,7 +150,7 @@ class Checkpoint:
             raise CheckpointError(f"it is of a run with other {name}: {pairs}")
         raise CheckpointError(f"it is of another {name} of casa_sara: {found}, and this is {wanted}")
 
-    def refusal(self, reason):
+    def refusal(self, reason: object) -> CheckpointError:
         """Return the error why the run cannot be continued from the file."""
         return CheckpointError(f"restart = True: '{self.path}' cannot be continued: {reason}. Use the same data and "
                                "parameters, or set restart = False and overwrite = True to start anew, or choose "

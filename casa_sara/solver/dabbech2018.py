@@ -6,11 +6,14 @@ The task runs them with ``method='dabbech2018'``.  One iteration is that of :mod
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from casa_sara.options import SolverOptions
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, SolverRecord
 
 __all__ = ["PaperBounds", "PaperSchedule", "PaperStage", "solve"]
@@ -63,8 +66,17 @@ class PaperSchedule:
     niter: int = 100_000
 
     @classmethod
-    def of(cls, options):
-        """The paper's values, but for those that task parameters, set to other than their defaults, give."""
+    def of(cls, options: SolverOptions) -> PaperSchedule:
+        """The paper's values, but for those that task parameters, set to other than their defaults, give.
+
+        Parameters
+        ----------
+        options : SolverOptions
+
+        Returns
+        -------
+        PaperSchedule
+        """
         names = dict(boundrelchange="gamma_1", boundtol="gamma_2", boundstep="gamma_3", boundinterval="interval",
                      reweightdecay="omega", nreweights="reweightings", reweighttol="varrho", reltol="reltol",
                      finalreltol="final_reltol", niter="niter")
@@ -113,30 +125,51 @@ class PaperBounds:
         self._moved = np.zeros(len(self.l2_bounds), int)
 
     @property
-    def total_weight(self):
+    def total_weight(self) -> float:
         """Σ_j σ_j⁻² Σ w for the noise σ_j = ε_j/√(2M_j) of each block."""
         return float(np.sum(self.weight_sums * 2.0 * self.samples / self.l2_bounds**2))
 
-    def adapt(self, ppd, schedule):
-        """Steps 7–10 at the end of iteration t; return whether any bound moved."""
+    def adapt(self, ppd: AdaptivePPD, schedule: PaperSchedule) -> bool:
+        """Steps 7–10 at the end of iteration t; return whether any bound moved.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            After its step; takes the bounds.
+        schedule : PaperSchedule
+
+        Returns
+        -------
+        bool
+        """
         settled, self._sigma = self._sigma < schedule.gamma_1, ppd.rel_change
         off = np.abs(ppd.residual_norms - self.l2_bounds) > schedule.gamma_2 * self.l2_bounds
         move = off & (ppd.iteration - self._moved >= schedule.interval) & (settled and self.adapts)
         nearer = schedule.gamma_3 * ppd.residual_norms + (1 - schedule.gamma_3) * self.l2_bounds
         self.l2_bounds = np.where(move, nearer, self.l2_bounds)
         self._moved[move] = ppd.iteration
-        ppd.l2_bounds = self.l2_bounds
+        ppd.constrain(self.l2_bounds)
         return bool(move.any())
 
-    def met_by(self, ppd, schedule):
-        """Whether μ_j ≤ ε_j for all blocks, to within γ2."""
+    def met_by(self, ppd: AdaptivePPD, schedule: PaperSchedule) -> bool:
+        """Whether μ_j ≤ ε_j for all blocks, to within γ2.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+        schedule : PaperSchedule
+
+        Returns
+        -------
+        bool
+        """
         return bool(np.all(ppd.residual_norms <= (1 + schedule.gamma_2) * self.l2_bounds))
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return what has changed since the start."""
         return {name: getattr(self, name) for name in self._changing}
 
-    def set_state(self, state):
+    def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned."""
         self.l2_bounds, self._moved = np.array(state["l2_bounds"]), np.array(state["_moved"])
         self._sigma = float(state["_sigma"])
@@ -167,20 +200,23 @@ class PaperStage:
         """Number of re-weightings so far."""
         return len(self.record.reweightings)
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return all of it: plain values, and the arrays themselves."""
         return vars(self) | dict(record=self.record.state())
 
     @classmethod
-    def of(cls, state):
+    def of(cls, state: dict[str, Any]) -> PaperStage:
         """Make it of what :meth:`state` has returned."""
         stage = cls(np.array(state["previous"]), state["norm"], state["last"])
         stage.record.set_state(state["record"])
         return stage
 
 
-def solve(ppd, bounds, schedule=PaperSchedule(), progress=lambda ppd, record: None, stopped=lambda: False,
-          keep=lambda stage, now: None, stage=None):
+def solve(ppd: AdaptivePPD, bounds: PaperBounds, schedule: PaperSchedule = PaperSchedule(),
+          progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None,
+          stopped: Callable[[], bool] = lambda: False,
+          keep: Callable[[PaperStage, bool], None] = lambda stage, now: None,
+          stage: PaperStage | None = None) -> SolverRecord:
     """Algorithm 2: solve, re-weight, and solve again, each time from the primal and dual variables there are.
 
     Parameters
@@ -199,9 +235,8 @@ def solve(ppd, bounds, schedule=PaperSchedule(), progress=lambda ppd, record: No
     if stage is None:
         stage = PaperStage(ppd.model.copy())
         stage.record.bounds.append((0, bounds.l2_bounds.copy()))
-        ppd.l1_weights = ppd.dictionary.allocate()
-        ppd.l1_weights[...] = 1  # W⁽⁰⁾
-    ppd.l2_bounds, ppd.dictionary.norm, record = bounds.l2_bounds, stage.norm, stage.record
+    ppd.constrain(bounds.l2_bounds)
+    ppd.dictionary.norm, record = stage.norm, stage.record
     while True:
         stage.last = stage.last or stage.k >= schedule.reweightings
         record.stop_code = _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep)
@@ -217,9 +252,9 @@ def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
     """Algorithm 1 for one set of weights; return its stop code."""
     tolerance, record = schedule.final_reltol if stage.last else schedule.reltol, stage.record
     while True:
-        ppd.step()
+        ppd.step()  # Steps 5–6 and 11–19
         record.note(ppd, stage.k)
-        moved = bounds.adapt(ppd, schedule)
+        moved = bounds.adapt(ppd, schedule)  # Steps 7–10
         if moved:
             record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))
         progress(ppd, record)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.ndimage import find_objects, label
 from scipy.signal import fftconvolve
 
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.matched_filter import BEAMS, SIGMA_TO_FWHM
+from casa_sara.solver.record import SolverRecord
 from casa_sara.solver.significance import gradient_image, matched_filter
 
 __all__ = ["STRUCTURE", "islands_of", "look_at"]
@@ -14,7 +19,7 @@ __all__ = ["STRUCTURE", "islands_of", "look_at"]
 STRUCTURE = 5.0  # standard deviations over a beam or more, from which on a residual is not noise
 
 
-def look_at(ppd, bounds, record):
+def look_at(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, record: SolverRecord) -> bool:
     """Note in the record the islands of the model and the peaks of the residual, where a support confines the model.
 
     Parameters
@@ -43,7 +48,7 @@ def _peaks(filter_, gradient):
             for scale, beams in enumerate(BEAMS[:len(filter_.widths)])]
 
 
-def islands_of(model, psf, unit_jy=1.0):
+def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list[dict[str, Any]]:
     """List the connected regions of a model, the most significant first.
 
     Parameters

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
+
 __all__ = ["band_noise", "first_weights", "reweight"]
 
 SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at the end
@@ -13,7 +16,8 @@ APPROXIMATIONS = 0.12  # of the prior on them within a support: they hold the fl
 POINTS = 0.25  # of the prior, on sources that one point explains
 
 
-def band_noise(ppd, bounds, seed=20180404):
+def band_noise(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds,
+               seed: int = 20180404) -> tuple[np.ndarray, float]:
     """Standard deviation of the noise in every band of the dictionary, and of a pixel, in the unit of the model.
 
     One realisation of the noise, weighted by 1/σ_j² as the data are, is carried to the image and normalised by
@@ -63,14 +67,21 @@ def _rms(values):
     return float(np.sqrt(sum(np.square(slab, dtype=float).sum() for slab in slabs) / values.size))
 
 
-def first_weights(ppd, bounds, confined=False):
+def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confined: bool = False) -> None:
     """W = ν: the noise of every band in units of a pixel's, but at least 1; those of the approximations less if `confined`.
 
     Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
     threshold at the noise of one pixel would let it through.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+        Its `l1_weights` are set.
+    bounds : GivenBounds or AdaptiveBounds
+        Whose noise levels are the noise.
+    confined : bool
+        A support confines the model.
     """
-    if ppd.l1_weights is None:
-        ppd.l1_weights = ppd.dictionary.allocate()
     noise, pixel = band_noise(ppd, bounds)
     for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel) * _shares(ppd, confined)):
         ppd.l1_weights[band.slice] = scale
@@ -87,7 +98,7 @@ def _shares(ppd, confined):
                      for band in ppd.dictionary.bands()])
 
 
-def reweight(ppd, bounds, scale, confined=False):
+def reweight(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, scale: float, confined: bool = False) -> None:
     """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less.
 
     Within a support of what is significant (`confined`) the coarse bands cannot fill with noise any more, and the prior

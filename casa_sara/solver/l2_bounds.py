@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 import numpy as np
+import numpy.typing as npt
+
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
 
 __all__ = ["AdaptiveBounds", "GivenBounds", "chi_square_bounds"]
 
 
-def chi_square_bounds(samples, noise=1.0):
+def chi_square_bounds(samples: np.ndarray, noise: npt.ArrayLike = 1.0) -> np.ndarray:
     """Bounds ε_j that hold the noise of each block with a margin of two standard deviations.
 
     A whitened complex sample has unit variance in its real and in its imaginary part when WEIGHT = 1/σ², so
@@ -61,38 +65,37 @@ class _NoiseLevels:
     weight_sums: np.ndarray
     n_bases: int
     regscale: float = 1.0
-    _changing = ("l2_bounds",)
+    _changing: ClassVar[tuple[str, ...]] = ("l2_bounds",)
 
     @property
-    def noise(self):
+    def noise(self) -> np.ndarray:
         """σ_j: noise level relative to the MS weights, (d,)."""
         return self.l2_bounds / np.sqrt(2.0 * self.samples)
 
     @property
-    def noise_weights(self):
+    def noise_weights(self) -> np.ndarray:
         """1/σ_j², (d,)."""
         return self.noise**-2.0
 
     @property
-    def total_weight(self):
+    def total_weight(self) -> float:
         """Σ_j σ_j⁻² Σ w: the peak of the point spread function of the weighted data."""
         return float(np.sum(self.weight_sums * self.noise_weights))
 
     @property
-    def gradient_noise(self):
+    def gradient_noise(self) -> float:
         """κ_g."""
         return self.regscale * np.sqrt(self.total_weight / self.n_bases)
 
-    def apply_to(self, ppd):
+    def apply_to(self, ppd: AdaptivePPD) -> None:
         """Hand the multipliers to the iteration, for its current κ."""
-        ppd.l2_bounds = None
-        ppd.multipliers[:] = ppd.threshold / (ppd.l2_step * self.gradient_noise) * self.noise_weights
+        ppd.penalise(ppd.threshold / (ppd.l2_step * self.gradient_noise) * self.noise_weights)
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return what has changed since the start."""
         return {name: getattr(self, name) for name in self._changing}
 
-    def set_state(self, state):
+    def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned."""
         for name in self._changing:
             value = state[name]
@@ -103,17 +106,28 @@ class _NoiseLevels:
 class GivenBounds(_NoiseLevels):
     """Bounds that stay as they are, and are hard constraints ‖y_j − Φ_j x‖ ≤ ε_j of the last problem."""
 
-    def finish(self, ppd):
+    def finish(self, ppd: AdaptivePPD) -> None:
         """Make the bounds hard constraints, from where the multipliers have led."""
-        ppd.l2_bounds = self.l2_bounds
+        ppd.constrain(self.l2_bounds)
 
-    def adapt(self, ppd):
+    def adapt(self, ppd: AdaptivePPD) -> bool:
         """Nothing adapts; return False."""
         return False
 
-    def met_by(self, ppd, slack=1.0):
-        """Whether every block's residual is inside its bound, but for a relative 1e-3 × slack."""
-        return ppd.l2_bounds is None or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3 * slack)))
+    def met_by(self, ppd: AdaptivePPD, slack: float = 1.0) -> bool:
+        """Whether every block's residual is inside its bound, but for a relative 1e-3 × slack.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+        slack : float
+            Factor on the tolerance.
+
+        Returns
+        -------
+        bool
+        """
+        return not ppd.constrained or bool(np.all(ppd.residual_norms <= self.l2_bounds * (1 + 1e-3 * slack)))
 
 
 @dataclass
@@ -144,11 +158,21 @@ class AdaptiveBounds(_NoiseLevels):
         self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
         self._last_move = np.zeros(len(self.l2_bounds), int)
 
-    def finish(self, ppd):
+    def finish(self, ppd: AdaptivePPD) -> None:
         """Nothing changes for the last problem."""
 
-    def adapt(self, ppd):
-        """Steps 7–10; return whether any bound moved."""
+    def adapt(self, ppd: AdaptivePPD) -> bool:
+        """Steps 7–10; return whether any bound moved.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            After its step; takes the multipliers of the new bounds.
+
+        Returns
+        -------
+        bool
+        """
         if ppd.rel_change >= self.rel_change:
             return False
         move = (ppd.iteration - self._last_move >= self.min_interval) & self._off_target(ppd)
@@ -160,8 +184,19 @@ class AdaptiveBounds(_NoiseLevels):
         self.apply_to(ppd)
         return True
 
-    def met_by(self, ppd, slack=1.0):
-        """Whether every block's residual agrees with its bound, to slack × γ2."""
+    def met_by(self, ppd: AdaptivePPD, slack: float = 1.0) -> bool:
+        """Whether every block's residual agrees with its bound, to slack × γ2.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+        slack : float
+            Factor on the tolerance γ2.
+
+        Returns
+        -------
+        bool
+        """
         return not np.any(self._off_target(ppd, slack))
 
     def _off_target(self, ppd, slack=1.0):

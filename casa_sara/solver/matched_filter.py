@@ -53,21 +53,22 @@ class MatchedFilter:
         Fraction of a source that another peak must exceed not to be one of its sidelobes.
     """
 
-    def __init__(self, psf, workers=1):
+    def __init__(self, psf: np.ndarray, workers: int = 1) -> None:
         self.psf, self.shape, self._workers = psf, psf.shape, workers
         self._plateau = max(float(psf.mean()), 0.0)
         self.beam = _beam(psf - self._plateau)
         self.widths = [width * self.beam for width in BEAMS if width * self.beam <= LARGEST * min(psf.shape)]
         self._padded = [fft.next_fast_len(int(n + 2 * (self.widths[-1] + self.beam)), real=True) for n in psf.shape]
-        self._known, self._cut = {}, {}
+        self._known: dict[int, tuple] = {}
+        self._cut: dict[int, list] = {}
         outside = np.where(self._near(psf, NEAR_WIDE), 0, psf).max() / psf[_centre(psf)]
         self.sidelobe = float(np.clip(MARGIN * outside, LEAST_SIDELOBE, MOST_SIDELOBE))
 
-    def norm(self, scale):
+    def norm(self, scale: int) -> float:
         """‖Σ^{−½}Φq‖ of template number `scale`."""
         return self._response(scale)[0]
 
-    def snr(self, gradient, scale):
+    def snr(self, gradient: np.ndarray, scale: int) -> np.ndarray:
         """Return T of template number `scale` for the residual, real (nx, ny).
 
         Parameters
@@ -79,7 +80,7 @@ class MatchedFilter:
         found = gradient * self._template(self.widths[scale])
         return self._per_noise(self._image(found), scale)
 
-    def nearby(self, model, scale):
+    def nearby(self, model: np.ndarray, scale: int) -> np.ndarray:
         """Return what a model near each pixel adds to T of template number `scale`, real (nx, ny).
 
         Parameters
@@ -135,8 +136,17 @@ class MatchedFilter:
         below = np.flatnonzero(np.bincount(ring, response.ravel()) < least * np.bincount(ring))
         return radius < (below[0] if below.size else max(response.shape))
 
-    def spectrum(self, image):
-        """Return what :meth:`snr` takes for an image (nx, ny)."""
+    def spectrum(self, image: np.ndarray) -> np.ndarray:
+        """Return what :meth:`snr` takes for an image (nx, ny).
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+
+        Returns
+        -------
+        complex, of the padded image
+        """
         padded = np.zeros(self._padded, np.float32)
         padded[:self.shape[0], :self.shape[1]] = image
         return fft.rfft2(padded, workers=self._workers, overwrite_x=True)
@@ -169,16 +179,38 @@ def _square(image, half):
     return padded[tuple(slice(c - half, c + half + 1) for c in centre)]
 
 
-def gaussian(half, width):
-    """A Gaussian of unit sum in a square of 2 half + 1 pixels; a pixel of 1 where the width is 0."""
+def gaussian(half: int, width: float) -> np.ndarray:
+    """A Gaussian of unit sum in a square of 2 half + 1 pixels; a pixel of 1 where the width is 0.
+
+    Parameters
+    ----------
+    half : int
+        The image has 2·half + 1 pixels along each axis.
+    width : float
+        FWHM in pixels; 0 for a point.
+
+    Returns
+    -------
+    float64 (2·half + 1, 2·half + 1)
+    """
     if not width:
         return (distance((2 * half + 1,) * 2) == 0).astype(float)
     values = np.exp(-0.5 * (distance((2 * half + 1,) * 2) * SIGMA_TO_FWHM / width) ** 2)
     return values / values.sum()
 
 
-def distance(shape):
-    """Distance of each pixel from that in the middle."""
+def distance(shape: tuple[int, int]) -> np.ndarray:
+    """Distance of each pixel from that in the middle.
+
+    Parameters
+    ----------
+    shape : (int, int)
+
+    Returns
+    -------
+    float64 (nx, ny)
+        Pixels.
+    """
     return np.hypot(*np.ogrid[tuple(slice(-(n // 2), n - n // 2) for n in shape)])
 
 

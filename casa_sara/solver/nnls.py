@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from casa_sara.solver import _kernels as kernels
+from casa_sara.solver.interfaces import Measurement
 
 __all__ = ["NNLS_ITERATIONS", "nnls"]
 
@@ -14,8 +17,10 @@ FEWEST_ITERATIONS = 10  # even if there is no time
 PATH = 0.75  # of the iterations, over which the penalty falls
 
 
-def nnls(measurement, vis, precond, data_norm_sq, max_iter=NNLS_ITERATIONS, last_penalty=1e-3, positivity=True,
-         stopped=lambda: False, support=None, reltol=0.0):
+def nnls(measurement: Measurement, vis: np.ndarray, precond: np.ndarray, data_norm_sq: float,
+         max_iter: int = NNLS_ITERATIONS, last_penalty: float = 1e-3, positivity: bool = True,
+         stopped: Callable[[], bool] = lambda: False, support: np.ndarray | None = None,
+         reltol: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
     """Minimise ½‖U^½(y − Φx)‖² + t‖x‖₁ over x ≥ 0 while t falls to almost nothing.
 
     Non-negative least squares alone fills what the data do not see (the flux beyond the shortest baseline

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 from numba import njit
+
+from casa_sara.solver.interfaces import Dictionary
 
 __all__ = ["PaperPrior"]
 
@@ -42,13 +47,14 @@ class PaperPrior:
         ‖ΨW‖ of the present weights.
     """
 
-    def __init__(self, dictionary, workers, norm_sq):
+    def __init__(self, dictionary: Dictionary, workers: Any, norm_sq: Callable[..., float]) -> None:
         self.dictionary, self._run, self._norm_sq = dictionary, workers.run, norm_sq
         self.n_bases, self.allocate = dictionary.n_bases, dictionary.allocate
         self._coefs = dictionary.allocate()
         self.norm = 1.0
 
-    def dual_step(self, model_bar, dual, threshold, weights, out, relaxation=RELAXATION):
+    def dual_step(self, model_bar: np.ndarray, dual: np.ndarray, threshold: float, weights: np.ndarray,
+                  out: np.ndarray, relaxation: float = RELAXATION) -> np.ndarray:
         """Update u in place (Step 13) and return ζΨWu.
 
         Parameters
@@ -72,7 +78,7 @@ class PaperPrior:
         out *= real(self.norm**-2.0)
         return out
 
-    def reweight(self, model, scale, weights):
+    def reweight(self, model: np.ndarray, scale: float, weights: np.ndarray) -> None:
         """Equation (5): W_i = ω^k/(ω^k + |Ψ_i†x|/max|Ψ_i†x|) in every basis i, and its ‖ΨW‖.
 
         Parameters

@@ -8,6 +8,7 @@ the data, its place: Lagrange's interpolation, with small negative pixels.  Only
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 __all__ = ["PointSources", "SIDE"]
 
@@ -32,7 +33,7 @@ class PointSources:
         Their values for a source of unit flux.
     """
 
-    def __init__(self, places=()):
+    def __init__(self, places: npt.ArrayLike = ()) -> None:
         self.places = np.array(places, float).reshape(-1, 2)
         first = np.floor(self.places).astype(int)
         square = np.indices((SIDE, SIDE)).reshape(2, -1) + NODES[0]
@@ -41,20 +42,20 @@ class PointSources:
         self.shapes = np.einsum("ni,nj->nij", along[:, 0], along[:, 1]).reshape(len(first), SIDE**2)
         self._sizes_sq = np.square(self.shapes).sum(axis=1)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.places)
 
-    def pixels(self, shape):
+    def pixels(self, shape: tuple[int, int]) -> np.ndarray:
         """Return the pixels of all sources, bool (nx, ny)."""
         covered = np.zeros(shape, bool)
         covered[self.x, self.y] = True
         return covered
 
-    def values(self, image):
+    def values(self, image: np.ndarray) -> np.ndarray:
         """Return what an image holds in the pixels of each source, float (n, 36)."""
         return image[self.x, self.y].astype(float)
 
-    def project(self, model, anchor, model_bar, before):
+    def project(self, model: np.ndarray, anchor: np.ndarray, model_bar: np.ndarray, before: np.ndarray) -> np.ndarray:
         """Project x⁺ on {a·s, a ≥ 0} around every source, in place, and x̄ = 2x⁺ − z with it: Step 17 there.
 
         Parameters

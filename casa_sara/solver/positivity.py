@@ -8,9 +8,13 @@ the source at the longest baselines.  The lower bound of the pixels is lowered t
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import binary_dilation, maximum_filter
+
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 
 __all__ = ["Release"]
 
@@ -37,7 +41,7 @@ class Release:
     def __init__(self):
         self._asked = np.zeros((), np.float32)  # g where a pixel asked in the last call, else 0
 
-    def update(self, ppd, bounds):
+    def update(self, ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> int:
         """Release what the residual of the present model asks for.
 
         Parameters
@@ -64,11 +68,11 @@ class Release:
         ppd.comm.settle()
         return int(np.count_nonzero(ppd.lowest) - count)
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return what the next call depends on."""
         return dict(asked=self._asked)
 
-    def set_state(self, state):
+    def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned."""
         self._asked = np.array(state["asked"])
 

@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import numpy as np
 
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel import SERIAL, Serial
 from casa_sara.solver import _kernels as kernels
 
 __all__ = ["ellipsoid_multiplier", "project_ellipsoid"]
 
 
-def ellipsoid_multiplier(dual, phi_bar, vis, precond, bound, multiplier=0.0, start=0, stop=None, tol=1e-10, comm=SERIAL):
+def ellipsoid_multiplier(dual: np.ndarray, phi_bar: np.ndarray, vis: np.ndarray, precond: np.ndarray, bound: float,
+                         multiplier: float = 0.0, start: int = 0, stop: int | None = None, tol: float = 1e-10,
+                         comm: Serial = SERIAL) -> float:
     """Lagrange multiplier of the projection onto one data ellipsoid.
 
-    The projection of s = U⁻¹v + Φx̄ in the metric U onto {z : ‖z − y‖ ≤ ε} is
+    The projection of s = U⁻¹v + Φx̄ in the metric U onto {q : ‖q − y‖ ≤ ε} is
 
-        z − y = U(s − y)/(U + λ),   with λ ≥ 0 the root of ‖z − y‖ = ε,
+        q − y = U(s − y)/(U + λ),   with λ ≥ 0 the root of n = ‖q − y‖ = ε,
 
-    and λ = 0 where s lies inside.  1/‖z − y‖ is concave and increasing in λ, nearly a straight line, so
-    Newton's iteration on 1/‖z − y‖ − 1/ε converges from any start in a few steps.
+    and λ = 0 where s lies inside.  1/n is concave and increasing in λ, nearly a straight line, so
+    Newton's iteration on 1/n − 1/ε converges from any start in a few steps.
 
     Parameters
     ----------
@@ -67,8 +69,8 @@ def _norms(comm, *arguments):
     return norms if comm.size == 1 else comm.sum(np.array(norms)).tolist()
 
 
-def project_ellipsoid(point, centre, precond, bound):
-    """Projection of `point` in the metric U onto the ball {z : ‖z − centre‖ ≤ bound}.
+def project_ellipsoid(point: np.ndarray, centre: np.ndarray, precond: np.ndarray, bound: float) -> np.ndarray:
+    """Projection of `point` in the metric U onto the ball {q : ‖q − centre‖ ≤ bound}.
 
     Parameters
     ----------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,15 @@ class SolverRecord:
         return STOP_DESCRIPTIONS.get(self.stop_code, "not finished")
 
     def note(self, ppd, reweighting: int) -> None:
-        """Add the state of the iteration `ppd`."""
+        """Add the state of the iteration `ppd`.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            After its step.
+        reweighting : int
+            Number of re-weightings before.
+        """
         self.iteration.append(ppd.iteration)
         self.reweighting.append(reweighting)
         self.rel_change.append(ppd.rel_change)
@@ -81,11 +90,11 @@ class SolverRecord:
         self.model_flux.append(ppd.model_flux * ppd.unit_jy)
         self.model_max.append(ppd.model_max * ppd.unit_jy)
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return the history so far as plain values."""
         return vars(self) | dict(bounds=[(iteration, bounds.tolist()) for iteration, bounds in self.bounds])
 
-    def set_state(self, state):
+    def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned, and note that the solution was resumed."""
         for name in vars(self):
             setattr(self, name, state[name])

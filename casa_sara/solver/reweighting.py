@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.islands import look_at
 from casa_sara.solver.l1_weights import first_weights, reweight
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.positivity import Release
 from casa_sara.solver.record import (CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, STRUCTURED, UNFEASIBLE,
                                      SolverRecord)
@@ -106,13 +110,13 @@ class Stage:
         """Number of the problem, which is that of the re-weightings before it."""
         return len(self.record.reweightings)
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return all of it: plain values, and the arrays themselves."""
         return vars(self) | dict(release=self.release.state(), record=self.record.state(),
                                  support=self.support and self.support.state())
 
     @classmethod
-    def of(cls, state):
+    def of(cls, state: dict[str, Any]) -> Stage:
         """Make it of what :meth:`state` has returned."""
         stage = cls(np.array(state["previous"]), state["last"], state["start"], state["settled"])
         stage.release.set_state(state["release"])
@@ -121,8 +125,10 @@ class Stage:
         return stage
 
 
-def solve(ppd, bounds, schedule=Schedule(), progress=lambda ppd, record: None, stopped=lambda: False,
-          keep=lambda stage, now: None, stage=None):
+def solve(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, schedule: Schedule = Schedule(),
+          progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None,
+          stopped: Callable[[], bool] = lambda: False, keep: Callable[[Stage, bool], None] = lambda stage, now: None,
+          stage: Stage | None = None) -> SolverRecord:
     """Algorithm 2: solve, re-weight, and solve again until nothing changes.
 
     The weights start at W = ν, the noise of each band relative to that of a pixel (at least 1); those of re-weighting k
@@ -189,9 +195,9 @@ def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
     tolerance = schedule.final_reltol if stage.last else schedule.reltol
     record = stage.record
     while True:
-        ppd.step()
+        ppd.step()  # Steps 5–6 and 11–19
         record.note(ppd, stage.k)
-        if bounds.adapt(ppd):
+        if bounds.adapt(ppd):  # Steps 7–10
             record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))
         progress(ppd, record)
         if not np.isfinite(ppd.rel_change) or not np.isfinite(record.residual_norm[-1]):

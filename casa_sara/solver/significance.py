@@ -8,9 +8,13 @@ for.  Within it the prior needs to hold less (:mod:`casa_sara.solver.l1_weights`
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label
 
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.matched_filter import MatchedFilter
 from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.unresolved import unresolved
@@ -42,10 +46,10 @@ class SignificantSupport:
 
     """
 
-    def __init__(self, significance, begun=False):
+    def __init__(self, significance: float, begun: bool = False) -> None:
         self.significance, self.begun = float(significance), bool(begun)
 
-    def update(self, ppd, bounds):
+    def update(self, ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> int:
         """Confine the model to what is significant now.
 
         Parameters
@@ -99,18 +103,38 @@ class SignificantSupport:
                 rim |= _around_cores(found, width) & (snr >= FAINT * significance)
         return found | rim
 
-    def state(self):
+    def state(self) -> dict[str, Any]:
         """Return what the next call depends on, beside the state of the iteration."""
         return dict(significance=self.significance, begun=self.begun)
 
 
-def matched_filter(ppd, bounds):
-    """Return the :class:`MatchedFilter` of the data with the present noise levels."""
+def matched_filter(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> MatchedFilter:
+    """Return the :class:`MatchedFilter` of the data with the present noise levels.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+
+    Returns
+    -------
+    MatchedFilter
+    """
     return MatchedFilter(point_response(ppd, bounds), ppd.measurement.workers.count)
 
 
-def point_response(ppd, bounds):
-    """Return Φ†Σ⁻¹Φ of a pixel of 1 in the middle of the image, real (nx, ny)."""
+def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> np.ndarray:
+    """Return Φ†Σ⁻¹Φ of a pixel of 1 in the middle of the image, real (nx, ny).
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+
+    Returns
+    -------
+    real (nx, ny)
+    """
     vis, image = ppd.scratch_vis, ppd.scratch_image
     image.fill(0)
     image[tuple(n // 2 for n in image.shape)] = 1
@@ -119,8 +143,20 @@ def point_response(ppd, bounds):
     return ppd.adjoint(vis, image).copy()
 
 
-def gradient_image(ppd, bounds, model):
-    """Return Φ†Σ⁻¹(y − Φx), real (nx, ny)."""
+def gradient_image(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, model: np.ndarray) -> np.ndarray:
+    """Return Φ†Σ⁻¹(y − Φx), real (nx, ny).
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+    bounds : GivenBounds or AdaptiveBounds
+    model : real (nx, ny)
+        x, in the unit of the iteration.
+
+    Returns
+    -------
+    real (nx, ny)
+    """
     vis = ppd.scratch_vis
     ppd.measurement.forward(model, vis)
     np.subtract(ppd.vis, vis, out=vis)

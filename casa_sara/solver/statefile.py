@@ -14,6 +14,7 @@ import hashlib
 import json
 import os
 import struct
+from typing import Any
 
 import numpy as np
 
@@ -29,8 +30,14 @@ class CheckpointError(ValueError):
     """This run cannot be continued from the checkpoint; the message says why."""
 
 
-def fill(array, values):
+def fill(array: np.ndarray, values: np.ndarray) -> None:
     """Copy `values` into `array` of the same shape and type.
+
+    Parameters
+    ----------
+    array : ndarray
+        Changed in place.
+    values : ndarray
 
     Raises
     ------
@@ -42,7 +49,7 @@ def fill(array, values):
     array[...] = values
 
 
-def write(path, header, state):
+def write(path: str, header: dict[str, Any], state: dict[str, Any]) -> None:
     """Write a checkpoint, which takes its place when it is complete and on the disk.
 
     Parameters
@@ -58,7 +65,7 @@ def write(path, header, state):
     OSError
         It cannot be written; what was there is still there.
     """
-    arrays = {}
+    arrays: dict[str, np.ndarray] = {}
     tree = _split(state, arrays)
     listed = [dict(name=name, dtype=array.dtype.str, shape=array.shape, sha256=digest(array))
               for name, array in arrays.items()]
@@ -83,8 +90,12 @@ def write(path, header, state):
         os.close(folder)
 
 
-def read(path):
+def read(path: str) -> tuple[dict[str, Any], dict[str, Any]]:
     """Read a checkpoint and check every bit of it.
+
+    Parameters
+    ----------
+    path : str
 
     Returns
     -------
@@ -155,6 +166,15 @@ def _bytes(array):
     return array.reshape(-1).view(np.uint8)
 
 
-def digest(array):
-    """Return the SHA-256 of a C-contiguous array, as text."""
+def digest(array: np.ndarray) -> str:
+    """Return the SHA-256 of a C-contiguous array, as text.
+
+    Parameters
+    ----------
+    array : ndarray, C-contiguous
+
+    Returns
+    -------
+    str
+    """
     return hashlib.sha256(_bytes(array)).hexdigest()

@@ -12,7 +12,7 @@ from scipy import fft
 from scipy.ndimage import label, maximum_filter, shift
 from scipy.signal import fftconvolve
 
-from casa_sara.solver.matched_filter import distance, gaussian
+from casa_sara.solver.matched_filter import MatchedFilter, distance, gaussian
 from casa_sara.solver.point_sources import PointSources
 
 __all__ = ["unresolved"]
@@ -24,7 +24,8 @@ TEMPLATES, TEMPLATE_REACH = 3, 2.5  # widths at which what is left is looked at;
 ALL_BUT = 1.5  # times as much flux as the point has, at most, and five standard deviations
 
 
-def unresolved(filter_, gradient, model, support, allowed, significance):
+def unresolved(filter_: MatchedFilter, gradient: np.ndarray, model: np.ndarray, support: np.ndarray,
+               allowed: np.ndarray, significance: float) -> tuple[np.ndarray, PointSources]:
     """Find the sources in a support that one point explains.
 
     Parameters
