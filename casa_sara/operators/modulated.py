@@ -13,8 +13,9 @@ and the images T_k(s)·x stay real.  About as many terms are needed as c has rad
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from scipy.special import iv, jv
+
+from casa_sara import jit
 
 __all__ = ["ModulatedOperator", "bessel_factors", "terms_needed"]
 
@@ -137,7 +138,7 @@ def _power_series(order, c, sign):
     return total
 
 
-_jit = njit(nogil=True, cache=True, fastmath={"contract"})
+_jit = jit.kernel(fastmath={"contract"})
 
 
 @_jit

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from casa_sara import jit
 
 __all__ = ["PaperPrior"]
 
 RELAXATION = 1.0  # ρ: Algorithm 1 has no over-relaxation
 
 
-@njit(nogil=True, cache=True)
+@jit.kernel()
 def _dual_rows(coefs, dual, weights, limit, relaxation, worker, workers):
     """u ← u + ρ(clip(u + W c, ± limit) − u), c ← W u; all (rows, columns)."""
     for i in range(coefs.shape[0] * worker // workers, coefs.shape[0] * (worker + 1) // workers):
