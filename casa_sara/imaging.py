@@ -131,9 +131,10 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     checkpoint = checkpoint_of(selection, grid, options, output)
     if output.resume:
         comm.once(checkpoint.open)
-    with waiting_child() if comm.rank == 0 else nullcontext() as child, kernels_loading():  # both while CASA reads
+    with waiting_child() if comm.rank == 0 else nullcontext() as child:  # it starts while CASA reads
         # read
-        data, plane, grid = _read(selection, grid, output, crew)
+        with kernels_loading(log.info):
+            data, plane, grid = _read(selection, grid, output, crew)
         start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
         if output.images_stand:
             comm.once(_save_model, selection, data, grid, options, start)
