@@ -26,6 +26,7 @@ from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
 from casa_sara.snapshots import snapshot_blocks
+from casa_sara.warmup import kernels_loading
 
 __all__ = ["compare_images"]
 
@@ -285,7 +286,8 @@ class _Observed:
     def __init__(self, selection, plane, request, sets, notes):
         longitude, latitude = (float(angle) for angle in plane.centre)
         grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
-        data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
+        with kernels_loading(log.info):
+            data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
         notes.extend(data.notes)
         self._gridder = _common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)

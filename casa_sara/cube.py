@@ -26,6 +26,7 @@ from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOP
 from casa_sara.solving import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.timing import Pace, writing_seconds
 from casa_sara.visibilities import Visibilities
+from casa_sara.warmup import kernels_loading
 
 __all__ = ["Channel", "CubeResult", "make_cube"]
 
@@ -98,7 +99,8 @@ def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, optio
     if output.resume:
         checkpoint.file.open()
     # read
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+    with kernels_loading(log.info):
+        data = read_visibilities(selection, grid.phasecenter, grid.stokes)
     data.notes.extend(image_limits(data, grid))
     cube = _Cube.of(_Request(selection, grid, weighting, options, output), data, forecast.workload.channels)
     check_imagename(output.imagename, cube.plane.pb.shape, 2 * output.pbcor)

@@ -134,8 +134,9 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if output.resume:
         comm.once(checkpoint.open)
     request = _Request(selection, grid, weighting, options, output, limits, crew)
-    with waiting_child() if comm.rank == 0 else nullcontext() as child, kernels_loading():  # both while CASA reads
-        data, plane = _read(request)
+    with waiting_child() if comm.rank == 0 else nullcontext() as child:  # it starts while CASA reads
+        with kernels_loading(log.info):
+            data, plane = _read(request)
         if output.images_stand:
             return _complete(request, plane, data, forecast)
         part = split(data, output.blocks, comm)

@@ -23,6 +23,7 @@ from casa_sara.resources import available_memory, resident_memory
 from casa_sara.parallel import SERIAL
 from casa_sara.timing import measure
 from casa_sara.visibilities import sort_into_blocks
+from casa_sara.warmup import kernels_loading
 
 __all__ = ["foresee", "rehearse"]
 
@@ -99,7 +100,8 @@ def rehearse(selection, grid, options, blocks, limits):
         See :meth:`casa_sara.forecast.Forecast.summary`, with `seconds` of each part and `iterations`; `reason` instead where it
         does not fit.
     """
-    found, _ = foresee(selection, grid, options, limits)
+    with kernels_loading(log.info):
+        found, _ = foresee(selection, grid, options, limits)
     if not found.fits:
         try:
             found.require(limits.maxmem_gb)

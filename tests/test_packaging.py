@@ -34,6 +34,7 @@ ROOMS = {
         "casa_sara.mpi", "casa_sara.parallel", "numpy", "casashell", "mpi4py", *OF_USERS, *CASA,
     },
     "interrupt": set(),
+    "jit": {"numba"},
     "deadline": set(),
     "parallel": {"numpy"},
     "mpi": {"casa_sara.parallel", "numpy", "mpi4py"},
@@ -57,24 +58,24 @@ ROOMS = {
         "casa_sara.sharing", "casa_sara.snapshots", "casa_sara.visibilities", "numpy", "scipy", "astropy", *CASA,
     },
     "operators": {
-        "casa_sara.options", "casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy", "finufft", "ducc0", "numba",
-        "llvmlite", "pywt",
+        "casa_sara.jit", "casa_sara.options", "casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy", "finufft",
+        "ducc0", "numba", "llvmlite", "pywt",
     },
-    "solver": {"casa_sara.options", "casa_sara.parallel", "numpy", "scipy", "numba"},
+    "solver": {"casa_sara.jit", "casa_sara.options", "casa_sara.parallel", "numpy", "scipy"},
     "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
     "jsonfile": set(),
 }
 LIBRARY = (
-    "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions", "outliers", "problem", "papermethod", "operators", "solver",
+    "jit", "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions", "outliers", "problem", "papermethod", "operators", "solver",
     "analysis",
 )
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["warmup"] = {"casa_sara.operators", "casa_sara.solver", "numpy"}
+ROOMS["warmup"] = {"casa_sara.operators", "casa_sara.solver", "llvmlite", "numba", "numpy"}
 ROOMS["forecast"] = {"casa_sara.operators", "casa_sara.sharing"}
 ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
 ROOMS["rehearsal"] = {
-    "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", "numpy", *NUMERICS,
+    "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
 }
 ROOMS["solving"] = {
     "casa_sara", "casa_sara.casa", "casa_sara.deadline", "casa_sara.interrupt", "casa_sara.timing", "numpy", *NUMERICS,
@@ -82,14 +83,14 @@ ROOMS["solving"] = {
 ROOMS["cubestate"] = {"casa_sara.reconstruction", "casa_sara.solver", "numpy"}
 ROOMS["cube"] = {
     "casa_sara.casa", "casa_sara.cubestate", "casa_sara.deadline", "casa_sara.imaging", "casa_sara.interrupt",
-    "casa_sara.rehearsal", "casa_sara.solving", "casa_sara.timing", "numpy", *NUMERICS,
+    "casa_sara.rehearsal", "casa_sara.solving", "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
 }
 ROOMS["imaging"] = {
     "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.rehearsal", "casa_sara.solving",
     "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
 }
 ROOMS["injection"] = {"casa_sara.casa", "casa_sara.solving", "numpy", *NUMERICS}
-ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "numpy", *NUMERICS}
+ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "casa_sara.warmup", "numpy", *NUMERICS}
 ROOMS["demo"] = {
     "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "casa_sara.resources", "numpy", "finufft",
     "matplotlib", *NUMERICS,

@@ -1,7 +1,12 @@
-"""Kernels that a thread loads before they are needed: all of them, and none of them again."""
+"""Kernels that a thread loads before they are needed, all of them and none again; and compiles where they are missing."""
 
+import os
+import shutil
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
 
 PROGRAM = """
 import gc, sys
@@ -48,3 +53,91 @@ def test_a_run_needs_no_kernel_that_was_not_loaded():
     cold = run("cold")
     assert len(cold) > 8  # else this does not see what is loaded
     assert run("warm") == []
+
+
+# Compiling --------------------------------------------------------------------------------------
+
+COMPILE = "import sys; from casa_sara import warmup; {change}; warmup.compile_kernels(); print(warmup._mark())"
+LOADED = """
+from numba.core import event
+from casa_sara.warmup import kernels_loading
+said = []
+with event.install_recorder("numba:compile") as recorder, kernels_loading(said.append):
+    pass
+print([said, len(recorder.buffer)])
+"""
+WITHOUT = """
+from casa_sara import warmup
+said, warmup.compile_kernels = [], lambda: None
+with warmup.kernels_loading(said.append):
+    pass
+print([warmup._mark(), said])
+"""
+
+
+def environment(cache):
+    return {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(Path(__file__).parents[1])}
+
+
+def start(code, cache):
+    return subprocess.Popen([sys.executable, "-c", code], env=environment(cache), stdout=subprocess.PIPE, text=True)
+
+
+def output(process):
+    said, _ = process.communicate()
+    assert process.returncode == 0
+    return said
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """A folder of compiled code that two processes have filled at the same time; each has said where its mark is."""
+    folder = tmp_path_factory.mktemp("numba")
+    both = [start(COMPILE.format(change="pass"), folder) for _ in range(2)]
+    marks = {output(one).strip() for one in both}
+    assert len(marks) == 1 and Path(marks.pop()).exists()
+    return folder
+
+
+def test_what_is_compiled_is_found_and_not_announced(cache):
+    said, compiled = eval(output(start(LOADED, cache)))
+    assert said == [] and compiled == 0
+
+
+def test_two_processes_compile_each_kernel_once(cache):
+    """One file of compiled code for each kernel and signature; the gridding kernels have two widths."""
+    code = [path.name.split("-")[0] for path in cache.rglob("*.nbc")]
+    assert len(code) > 10
+    assert {name for name in code if code.count(name) > 1} == {"nufft._interpolate", "nufft._spread"}
+    assert not list(cache.rglob("*.tmp.*"))
+
+
+@pytest.mark.parametrize("mark", ["removed", "of another version"])
+def test_what_is_not_compiled_is_announced(cache, tmp_path, mark):
+    shutil.copytree(cache, tmp_path / "numba")
+    path, = (tmp_path / "numba").rglob("*.compiled")
+    path.unlink() if mark == "removed" else path.rename(path.with_name("casa_sara-0123456789abcdef.compiled"))
+    said, _ = eval(output(start(LOADED, tmp_path / "numba")))
+    assert len(said) == 1 and f"later runs find them in '{path.parent}'" in said[0]
+    assert path.exists()  # now it is
+
+
+def test_a_helper_that_is_killed_is_made_up_for(cache, tmp_path):
+    """Everything but the dictionary is there, and the process that is to compile this is killed: its parent does it."""
+    shutil.copytree(cache, tmp_path / "numba")
+    for path in (tmp_path / "numba").rglob("*"):
+        if path.name.startswith(("_wavelet", "casa_sara")):
+            path.unlink()
+    kill = "wait = warmup._wait_for; warmup._wait_for = lambda helper: (helper.kill(), wait(helper))"
+    mark = Path(output(start(COMPILE.format(change=kill), tmp_path / "numba")).strip())
+    assert mark.exists() and list(mark.parent.glob("_wavelet_kernels.transform*.nbc"))
+
+
+def test_without_a_folder_every_process_compiles_and_says_so(tmp_path):
+    """No folder can be written to: Numba's own error at import is not ours."""
+    (tmp_path / "file").touch()
+    only_here = {"NUMBA_CACHE_LOCATOR_CLASSES": "UserProvidedCacheLocator"}
+    found = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, check=True,
+                           env=environment(tmp_path / "file" / "below") | only_here)
+    mark, said = eval(found.stdout)
+    assert mark is None and len(said) == 1 and "NUMBA_CACHE_DIR" in said[0]

@@ -8,8 +8,12 @@ from __future__ import annotations
 import functools
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from typing import Any
 
-__all__ = ["Progress", "error", "info", "speak", "warn"]
+__all__ = ["Progress", "error", "info", "logged_task", "speak", "warn"]
 
 ORIGIN = "casa_sara"
 _silent = False  # this process is one of several, and another one speaks
@@ -34,12 +38,35 @@ def _own_sink():
 
     sink = casatools.logsink(config.logfile)
     sink.setglobal(True)
+    sink.post(f"casatools {casatools.version_string()}", "INFO", ORIGIN)
     return sink
 
 
 def _post(message, level):
     if not _silent:
         _sink().post(message, level, ORIGIN)
+
+
+@contextmanager
+def logged_task(name: str, arguments: dict[str, Any]) -> Iterator[Callable[[Any], None]]:
+    """Write beginning, arguments, error and end of a task as those of casatasks do; yield what takes its result."""
+    def post(message, level="INFO"):
+        _sink().post(message, level, name)
+
+    start, line, result = datetime.now(), 42 * "#", []
+    post(line)
+    post(f"##### Begin Task: {name:<18} #####")
+    post(f"{name}( {', '.join(f'{key}={value!r}' for key, value in arguments.items())} )")
+    try:
+        yield result.append
+    except Exception as error:
+        post(f"Task {name} raised an exception of class {type(error).__name__} with the following message: {error}", "ERROR")
+        raise
+    finally:
+        post(f"Result {name}: {result[0] if result else None!r}", "DEBUG")
+        post(f"Task {name} complete. Start time: {start} End time: {datetime.now()}")
+        post(f"##### End Task: {name:<20} #####")
+        post(line)
 
 
 def info(message):

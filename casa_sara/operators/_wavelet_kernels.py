@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numba.extending import register_jitable
 
+from casa_sara import jit
 from casa_sara.operators._simd import MAX_TAPS, VECTOR_BYTES
 from casa_sara.operators._wavelet_lines import (
     CLIP, CLIP_WEIGHTED, HALO, KEEP, SCRATCH_ROWS, TABLE_SIZE, Place, analyse_along, analyse_lines, compiled, late,
@@ -22,10 +22,11 @@ from casa_sara.operators._wavelet_lines import (
 CHUNK = 16  # lines of level 1 done in one go
 MARGIN = MAX_TAPS // 2 - 1  # image lines needed before those of a chunk
 WINDOW_ROWS = 2 * CHUNK + MAX_TAPS
+ANALYSE_FINEST, ANALYSE_DEEPER, SYNTHESISE_DEEPER, BOTH_DEEPER, SYNTHESISE_FINEST = range(5)  # stages
 ZERO, ONE = np.int64(0), np.int64(1)  # literals would make Numba compile the callee for each
-SOURCE = "b03389d0c5a7"  # digest of _simd.py and _wavelet_lines.py: the cache of compiled code watches this file only
+SOURCE = "8544e03fc4d5"  # digest of _simd.py and _wavelet_lines.py: the cache of compiled code watches this file only
 
-stage = njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract"})
+_inlined = jit.inner(error_model="numpy", fastmath={"contract"}, inline="always")
 
 
 class Filters(NamedTuple):
@@ -166,8 +167,8 @@ def _share(n, worker, workers):
     return n * worker // workers, n * (worker + 1) // workers
 
 
-@stage
-def analyse_finest(image, job, worker, workers):
+@_inlined
+def _analyse_finest(image, job, worker, workers):
     """Level 1 and Dirac: this worker's share of the lines of all bases."""
     filters, target, work = job
     nx, ny = target.coefs.shape[1:]
@@ -191,8 +192,8 @@ def analyse_finest(image, job, worker, workers):
                 update_pixels(_address(window, i - origin), place, filters.gain, target.params[b], target.mode)
 
 
-@stage
-def transform_deeper(job, forth, back, worker, workers):
+@_inlined
+def _transform_deeper(job, forth, back, worker, workers):
     """Levels 2, 3, … of the bases this worker owns: analysis if `forth`, synthesis if `back`."""
     levels = job.work.levels
     for b in range(job.filters.lengths.size):
@@ -206,8 +207,8 @@ def transform_deeper(job, forth, back, worker, workers):
             _synthesise(out, ZERO, b, level, ZERO, out.shape[0] // 2, job, worker)
 
 
-@stage
-def synthesise_finest(out, job, worker, workers):
+@_inlined
+def _synthesise_finest(out, job, worker, workers):
     """Level 1 and Dirac: this worker's share of the lines of the image."""
     filters, target, work = job
     nx, ny = target.coefs.shape[1:]
@@ -226,3 +227,17 @@ def synthesise_finest(out, job, worker, workers):
         for i in range(2 * begin, min(2 * end, out.shape[0])):
             for k in range(out.shape[1]):
                 out[i, k] = window[i - 2 * begin, k]
+
+
+@jit.kernel(error_model="numpy", fastmath={"contract"})
+def transform(stage, image, job, worker, workers):
+    """What one worker does of a stage: from the image, within the coefficients, or to the image.
+
+    One kernel for all stages: the two filters, which they share, take most of the time to compile.
+    """
+    if stage == ANALYSE_FINEST:
+        _analyse_finest(image, job, worker, workers)
+    elif stage == SYNTHESISE_FINEST:
+        _synthesise_finest(image, job, worker, workers)
+    else:
+        _transform_deeper(job, stage != SYNTHESISE_DEEPER, stage != ANALYSE_DEEPER, worker, workers)

@@ -13,9 +13,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from numba import njit
 from numba.extending import register_jitable
 
+from casa_sara import jit
 from casa_sara.operators._simd import (
     MAX_TAPS, VECTOR_BYTES, evens, filter_bank, lane_bytes, load, load_first, maximum, minimum, odds, prefetch, splat,
     store, store_first, zip_high, zip_low,
@@ -30,7 +30,7 @@ HALO = 16  # columns before and after the values of a scratch line
 SCRATCH_ROWS = 8
 TABLE_SIZE = 2 * MAX_TAPS
 
-compiled = njit(error_model="numpy", fastmath={"contract"})
+compiled = jit.inner(error_model="numpy", fastmath={"contract"})
 
 
 class Place(NamedTuple):

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from casa_sara import jit
 
 __all__ = ["RING_ROWS", "neighbourhood_weights"]
 
 RING_ROWS = 5  # sums of the three rows around, and of the first and the last row of the band
+MATH = {"error_model": "numpy", "fastmath": {"contract", "arcp"}}
+
+_compiled = jit.inner(**MATH)
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "arcp"})
+@_compiled
 def _row_sums(row, to):
     """Σ d² of every value and its two neighbours, periodic."""
     n = row.size
@@ -21,7 +25,7 @@ def _row_sums(row, to):
         to[k] = left * left + row[k] * row[k] + right * right
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "arcp"})
+@_compiled
 def _row_weights(row, above, here, below, alpha, scale):
     """s·α/(α + d̄), d̄² the mean of nine squares."""
     ninth = row.dtype.type(1 / 9)
@@ -29,7 +33,7 @@ def _row_weights(row, above, here, below, alpha, scale):
         row[k] = scale * alpha / (alpha + np.sqrt(ninth * (above[k] + here[k] + below[k])))
 
 
-@njit(nogil=True, cache=True, error_model="numpy", fastmath={"contract", "arcp"})
+@jit.kernel(**MATH)
 def neighbourhood_weights(coefs, rectangles, params, ring, worker, workers):
     """Replace the coefficients d of every `workers`-th band by s·α/(α + d̄).
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from casa_sara import jit
 from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import load, multiply_add, store, zeros
 
@@ -175,7 +175,8 @@ def scratch_shape(columns, workers):
     return workers, columns.factor + 2, shifts + vectors * len(WIDE)
 
 
-_jit = njit(nogil=True, cache=True)
+_jit = jit.kernel()
+_inlined = jit.inner(inline="always")  # one function to compile instead of seven
 
 
 @_jit
@@ -229,7 +230,7 @@ def expand_rows(lines, rows, image, worker, workers):
         _weigh_rows(image[group : group + size], lines[low:high], rows.taps, tap, -rows.factor, np.int64(1))
 
 
-@_jit
+@_inlined
 def _weigh_rows(out, rows, taps, first, row_step, out_step):
     """out[r] = Σ_t taps[first + t·row_step + r·out_step].real · rows[t], for at most GROUP rows r."""
     length = out.shape[1]
@@ -241,7 +242,7 @@ def _weigh_rows(out, rows, taps, first, row_step, out_step):
             _weigh_block(out, rows.reshape(-1), min(block, length - len(WIDE)), taps, first, row_step, out_step, WIDE)
 
 
-@_jit
+@_inlined
 def _weigh_block(out, rows, column, taps, first, row_step, out_step, lanes):
     """len(lanes) columns of `_weigh_rows`, in registers."""
     length, pixels = out.shape[1], out.reshape(-1)
@@ -259,7 +260,7 @@ def _weigh_block(out, rows, column, taps, first, row_step, out_step, lanes):
         sum0, sum1, sum2 = sum1, sum2, sum3
 
 
-@_jit
+@_inlined
 def _split_phases(line, columns, phases):
     """phases[q, k] = line[first + factor·k + q], zero beyond the borders."""
     phases[:] = 0
@@ -269,7 +270,7 @@ def _split_phases(line, columns, phases):
             phases[q, k] = line[columns.first + columns.factor * k + q]
 
 
-@_jit
+@_inlined
 def _join_phases(phases, columns, line):
     """Transpose of `_split_phases`."""
     for q in range(columns.factor):
@@ -278,7 +279,7 @@ def _join_phases(phases, columns, line):
             line[columns.first + columns.factor * k + q] = phases[q, k]
 
 
-@_jit
+@_inlined
 def _filter_phases(phases, columns, sums):
     """sums[:, j] = (Re, Im) of Σ_t taps[t] · line[first + factor·j + t]."""
     flat, width, both = phases.reshape(-1), phases.shape[1], sums.reshape(-1)
@@ -294,7 +295,7 @@ def _filter_phases(phases, columns, sums):
         store(both, width + j, imag)
 
 
-@_jit
+@_inlined
 def _spread_phases(sums, columns, phases, shifts):
     """Transpose of `_filter_phases`, from sums[:, shifts + j]; zeros surround them."""
     flat, width, both = phases.reshape(-1), phases.shape[1], sums.reshape(-1)

@@ -171,8 +171,8 @@ class SaraDictionary:
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
         job = self._job(coefs, kernels.KEEP)
-        self._workers.run(kernels.transform_deeper, job, False, True)
-        self._workers.run(kernels.synthesise_finest, out, job)
+        self._workers.run(kernels.transform, kernels.SYNTHESISE_DEEPER, out, job)
+        self._workers.run(kernels.transform, kernels.SYNTHESISE_FINEST, out, job)
         return out
 
     def dual_step(self, model_bar: np.ndarray, dual: np.ndarray, threshold: float | np.ndarray,
@@ -216,7 +216,7 @@ class SaraDictionary:
         else:
             job = self._job(dual, kernels.CLIP_WEIGHTED, self._checked(weights, "weights", self.coef_shape))
         self._analyse(model_bar, job, back=True)
-        self._workers.run(kernels.synthesise_finest, out, job)
+        self._workers.run(kernels.transform, kernels.SYNTHESISE_FINEST, out, job)
         return out
 
     def reweight(self, image: np.ndarray, alpha: float | np.ndarray, scale: float | np.ndarray,
@@ -282,8 +282,8 @@ class SaraDictionary:
 
     def _analyse(self, image, job, back=False):
         image = self._checked(np.ascontiguousarray(image, self.dtype), "image", self.shape)
-        self._workers.run(kernels.analyse_finest, image, job)
-        self._workers.run(kernels.transform_deeper, job, True, back)
+        self._workers.run(kernels.transform, kernels.ANALYSE_FINEST, image, job)
+        self._workers.run(kernels.transform, kernels.BOTH_DEEPER if back else kernels.ANALYSE_DEEPER, image, job)
 
 
 @cache

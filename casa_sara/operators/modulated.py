@@ -16,8 +16,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 from scipy.special import iv, jv
+
+from casa_sara import jit
 
 __all__ = ["ModulatedOperator", "bessel_factors", "terms_needed"]
 
@@ -178,7 +179,7 @@ def _power_series(order, c, sign):
     return total
 
 
-_jit = njit(nogil=True, cache=True, fastmath={"contract"})
+_jit = jit.kernel(fastmath={"contract"})
 
 
 @_jit

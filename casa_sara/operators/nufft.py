@@ -23,8 +23,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 import scipy.fft
-from numba import njit
 
+from casa_sara import jit
 from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import (
     gather_rows, multiply, pair_sums, polynomials, scale_pairs, scatter_rows, second_half_twice)
@@ -251,7 +251,7 @@ def _least_work(n_points, starts, counts, eps, dtype):
     return min(plans)[1:]
 
 
-_jit = njit(nogil=True, cache=True)
+_jit = jit.kernel()
 
 
 @_jit

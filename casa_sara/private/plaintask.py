@@ -1,11 +1,16 @@
-"""The common part of all tasks: checks, log messages and errors, as in casatasks."""
+"""What every task does around its implementation, as the tasks of casatasks do it: checks, log messages and errors.
+
+casatasks itself takes a second or two to import.
+"""
 
 from __future__ import annotations
 
+import importlib.util
 import threading
 from collections.abc import Callable
 from typing import Any
 
+from casa_sara.casa import log
 from casa_sara.private.validation import Parameter, validate
 
 __all__ = ["run_task"]
@@ -28,15 +33,9 @@ def run_task(
 
 
 def _run(name, parameters, implementation, values):
-    from casatasks.private.task_logging import end_log, except_log, start_log
-
-    state = start_log(name, [f"{key}={value!r}" for key, value in values.items()])
-    result = None
-    try:
+    if importlib.util.find_spec("casampi"):
+        import casatasks  # makes servers of all processes of an MPI job but one, which do not come back from here
+    with log.logged_task(name, values) as tell_result:
         result = implementation(**validate(parameters, values))
-    except Exception as error:
-        except_log(name, error)
-        raise
-    finally:
-        end_log(state, name, result)
+        tell_result(result)
     return result

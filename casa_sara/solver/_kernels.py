@@ -1,9 +1,10 @@
 """Compiled passes over visibilities and pixels; each reads and writes every array once."""
 
 import numpy as np
-from numba import njit
 
-_jit = njit(nogil=True, cache=True, fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
+from casa_sara import jit
+
+_jit = jit.kernel(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 
 
 @_jit

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import find_objects, label
-from scipy.signal import fftconvolve
 
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.convolution import convolve_valid
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.matched_filter import BEAMS, SIGMA_TO_FWHM
 from casa_sara.solver.record import SolverRecord
@@ -91,4 +91,4 @@ def _response(part, psf):
     kernel = np.zeros((2 * nx - 1, 2 * ny - 1))
     left, low, right, high = min(cx, nx - 1), min(cy, ny - 1), min(psf.shape[0] - cx, nx), min(psf.shape[1] - cy, ny)
     kernel[nx - 1 - left:nx - 1 + right, ny - 1 - low:ny - 1 + high] = psf[cx - left:cx + right, cy - low:cy + high]
-    return fftconvolve(kernel, part, mode="valid") if part.size > 1 else kernel * part
+    return convolve_valid(kernel, part) if part.size > 1 else kernel * part

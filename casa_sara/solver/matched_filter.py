@@ -20,7 +20,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 from scipy.ndimage import label
-from scipy.signal import fftconvolve
+
+from casa_sara.solver.convolution import convolve_valid
 
 __all__ = ["MatchedFilter", "distance", "gaussian"]
 
@@ -118,7 +119,7 @@ class MatchedFilter:
             width = self.widths[scale]
             half = min(int(np.ceil(SQUARE * (width + self.beam))), (min(self._padded) - 1) // 2)
             psf = _square(self.psf, 2 * half)
-            response = fftconvolve(psf, gaussian(half, width), mode="valid") if width else _square(psf, half)
+            response = convolve_valid(psf, gaussian(half, width)) if width else _square(psf, half)
             norm_sq = float(np.vdot(response, gaussian(half, width)))
             norm = np.sqrt(norm_sq) if norm_sq > 0 else np.inf  # where no baseline sees the template, T is 0
             near = np.where(self._near(response, NEAR_WIDE if width else NEAR), response, 0)

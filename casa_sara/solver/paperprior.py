@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from casa_sara import jit
 
 from casa_sara.solver.interfaces import Dictionary
 
@@ -15,7 +16,7 @@ __all__ = ["PaperPrior"]
 RELAXATION = 1.0  # ρ: Algorithm 1 has no over-relaxation
 
 
-@njit(nogil=True, cache=True)
+@jit.kernel()
 def _dual_rows(coefs, dual, weights, limit, relaxation, worker, workers):
     """u ← u + ρ(clip(u + W c, ± limit) − u), c ← W u; all (rows, columns)."""
     for i in range(coefs.shape[0] * worker // workers, coefs.shape[0] * (worker + 1) // workers):

@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 from scipy import fft
 from scipy.ndimage import label, maximum_filter, shift
-from scipy.signal import fftconvolve
 
+from casa_sara.solver.convolution import convolve_valid
 from casa_sara.solver.matched_filter import MatchedFilter, distance, gaussian
 from casa_sara.solver.point_sources import PointSources
 
@@ -109,7 +109,7 @@ class _Patch:
             return None
         wide = tuple(slice(k - self.outer, k + self.outer + 1) for k in peak)
         # the gradient of the data without the other sources
-        alone = gradient[wide] + fftconvolve(self._psf, near, mode="valid")
+        alone = gradient[wide] + convolve_valid(self._psf, near)
         o = self.outer
         offset = [_vertex(alone[o - 1:o + 2, o]), _vertex(alone[o, o - 1:o + 2])]
         inner = slice(self.reach - 3, len(self._psf) - self.reach + 3)
