@@ -9,7 +9,7 @@ import pytest
 
 pytest.importorskip("casatools")
 
-from simulated_ms import CYGNUS_A, add_column, column, direction_cosines, edit, simulate  # noqa: E402
+from simulated_ms import CYGNUS_A, _tool, add_column, column, direction_cosines, edit, simulate  # noqa: E402
 
 from casa_sara.casa import modelcolumn  # noqa: E402
 from casa_sara.casa.modelcolumn import check_model_column_writable, save_model_column, write_model_column  # noqa: E402
@@ -217,7 +217,12 @@ def test_writable_check(copied, monkeypatch):
             with pytest.raises(OSError, match="savemodel = 'modelcolumn' needs"):
                 check_model_column_writable(selection)
     add_column(copied, "MODEL_DATA", None)
-    check_model_column_writable(selection)
+    tb = _tool("table")
+    tb.open(str(copied), nomodify=False)
+    for row in range(tb.nrows()):  # two shapes
+        tb.putcell("MODEL_DATA", row, tb.getcell("DATA", row))
+    tb.close()
+    check_model_column_writable(selection)  # what is there needs no space
 
 
 def test_write_protected(copied, monkeypatch):
