@@ -26,6 +26,7 @@ IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve", "joblib", "cloudpic
 EXCEPTIONS = {
     ("mpi.py", "pickle"): "an error of its own is packed and unpacked, to see whether mpi4py can send it",
     ("casa/child.py", "subprocess"): "this Python, told its job by JSON and names out of a list of its own",
+    ("warmup.py", "subprocess"): "this Python, with a fixed text that compiles the kernels of the dictionary",
     ("private/shelltask.py", "runpy"): "tget runs what tput saved, as CASA's own tasks do",
     ("private/shelltask.py", "runpy.run_path"): "tget runs what tput saved, as CASA's own tasks do",
 }
