@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from dense_problem import Problem
 from scipy.optimize import nnls
+from scipy.signal import convolve2d
 from test_visibilities import observation
 
 from casa_sara.operators.dictionary import SaraDictionary
@@ -13,6 +14,7 @@ from casa_sara.problem import Samples
 from casa_sara.reconstruction import Control, reconstruct
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
+from casa_sara.solver.convolution import convolve_valid
 from casa_sara.solver.islands import islands_of, look_at
 from casa_sara.solver.l1_weights import band_noise, first_weights, reweight
 from casa_sara.solver.l2_bounds import GivenBounds
@@ -229,6 +231,13 @@ def test_the_largest_sidelobe_of_a_point_spread_function_is_found(level, expecte
     lobes = [(1, 0, 0), (level, 17, 5), (level, -17, -5)]
     psf = sum(factor * gaussian((72, 64), 36 + i, 32 + j, 4.0) for factor, i, j in lobes)
     assert MatchedFilter(50 * psf).sidelobe == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("image, kernel", [((21, 18), (8, 5)), ((9, 9), (9, 9)), ((12, 7), (1, 4)), ((1, 6), (1, 1)), ((5, 5), (1, 1))])
+def test_convolution_is_that_of_scipy(image, kernel):
+    rng = np.random.default_rng(8)
+    a, b = rng.standard_normal(image), rng.standard_normal(kernel)
+    np.testing.assert_allclose(convolve_valid(a, b), convolve2d(a, b, mode="valid"), atol=1e-12)
 
 
 # ---- the support, in whole solutions
