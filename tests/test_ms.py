@@ -491,7 +491,7 @@ def test_moving_field_is_refused(copied):
     tb.addcols({"EPHEMERIS_ID": tb.getcoldesc("SOURCE_ID")})
     tb.putcol("EPHEMERIS_ID", add_ephemeris)
     tb.close()
-    with pytest.raises(ValueError, match=r"field \[1\] \(FIELD1\) .* moves on the sky"):
+    with pytest.raises(ValueError, match=r"vis = .*: field \[1\] \(FIELD1\) moves on the sky"):
         read(copied)
 
 

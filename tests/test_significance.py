@@ -602,6 +602,19 @@ def test_islands_are_measured():
     assert (corner["x"], corner["y"]) == (0, 49)
 
 
+@pytest.mark.parametrize("place", [(14.3, 20.7), (10.5, 30.0), (22.0, 9.0)])
+def test_the_island_of_a_point_between_pixels_is_a_point(sums, place):
+    """At its place and without extent, though 36 pixels of both signs hold it; where both signs cancel, the modulus tells."""
+    point = PointSources([place])
+    model = np.zeros(sums.shape)
+    model[point.x, point.y] = 0.3 * point.shapes
+    (island,) = islands_of(model, sums.psf)
+    assert (island["x"], island["y"]) == pytest.approx(place, abs=1e-6)
+    assert island["flux_jy"] == pytest.approx(0.3) and island["fwhm_pixels"] < 1e-3
+    (pair,) = islands_of(pixel(sums.shape, 10, 12) - pixel(sums.shape, 10, 13), sums.psf)
+    assert (pair["x"], pair["y"]) == (10, 12.5) and pair["fwhm_pixels"] == pytest.approx(2.35482 * np.sqrt(0.125))
+
+
 def test_flux_error_of_an_island_is_that_of_its_strength():
     """The strength of a known shape, fitted to many realisations of the noise, scatters by it."""
     sums = Sums((32, 32), 400)

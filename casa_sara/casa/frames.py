@@ -96,6 +96,9 @@ def _direction_of(phasecenter, first):
         return first.fields[min(first.fields)]
     if text.isdigit():
         return _field_direction(int(text), first)
+    if text.upper() in ("TRACKFIELD", *_OF_OBJECTS):
+        raise ValueError(f"phasecenter = '{phasecenter}': moving sources cannot be followed: it takes a field number or a "
+                         "direction on the sky")
     words = text.split()
     if len(words) == 2:
         words.insert(0, "J2000")

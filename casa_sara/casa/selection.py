@@ -284,6 +284,6 @@ def _refuse_moving(name, field_ids):
     if moving.any():
         names = np.array(texts(name, "FIELD", "NAME"))[field_ids]
         raise ValueError(
-            f"field {field_ids[moving].tolist()} ({', '.join(names[moving])}) of '{name}' moves on the sky "
-            "(ephemeris or polynomial): moving sources cannot be imaged, select other fields"
+            f"vis = '{name}': field {field_ids[moving].tolist()} ({', '.join(names[moving])}) moves on the sky "
+            "(ephemeris or polynomial): moving sources cannot be imaged, select other fields with the parameter field"
         )

@@ -168,33 +168,11 @@ class NoVisibilities:
         self.complex_dtype, self.workers = np.result_type(self.dtype, np.complex64), Workers(nthreads)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return no visibilities.
-
-        Parameters
-        ----------
-        image : real (nx, ny)
-        out : complex (M,), optional
-            Receives the result.
-
-        Returns
-        -------
-        complex (M,)
-        """
+        """Return no visibilities."""
         return np.empty(0, self.complex_dtype) if out is None else out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return zeros (nx, ny), in `out` where given.
-
-        Parameters
-        ----------
-        vis : complex (M,)
-        out : real (nx, ny), optional
-            Receives the result.
-
-        Returns
-        -------
-        real (nx, ny)
-        """
+        """Return zeros (nx, ny), in `out` where given."""
         out = np.empty(self.shape, self.dtype) if out is None else out
         out.fill(0)
         return out

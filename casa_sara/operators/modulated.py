@@ -57,18 +57,7 @@ class ModulatedOperator:
         self._vis = np.empty(self.size, self.complex_dtype)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given.
-
-        Parameters
-        ----------
-        image : real (nx, ny)
-        out : complex (M,), optional
-            Receives the result.
-
-        Returns
-        -------
-        complex (M,)
-        """
+        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
         image = np.ascontiguousarray(image, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         if image.shape != self.shape or out.shape != (self.size,) or out.dtype != self.complex_dtype:
@@ -83,18 +72,7 @@ class ModulatedOperator:
         return out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,).
-
-        Parameters
-        ----------
-        vis : complex (M,)
-        out : real (nx, ny), optional
-            Receives the result.
-
-        Returns
-        -------
-        real (nx, ny)
-        """
+        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
         vis = np.ascontiguousarray(vis, self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
         if vis.shape != (self.size,) or out.shape != self.shape or out.dtype != self.dtype:

@@ -24,33 +24,11 @@ class Measurement(Protocol):
     workers: Any
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Φ·image, in `out` where given.
-
-        Parameters
-        ----------
-        image : real (nx, ny)
-        out : complex (M,), optional
-            Receives the result.
-
-        Returns
-        -------
-        complex (M,)
-        """
+        """Return Φ·image, complex (M,), of a real image (nx, ny), in `out` where given."""
         ...
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Re(Φ†·vis), in `out` where given.
-
-        Parameters
-        ----------
-        vis : complex (M,)
-        out : real (nx, ny), optional
-            Receives the result.
-
-        Returns
-        -------
-        real (nx, ny)
-        """
+        """Return Re(Φ†·vis), real (nx, ny), of complex (M,), in `out` where given."""
         ...
 
 

@@ -65,22 +65,23 @@ def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list
     list of dict
         `x`, `y` (pixel of the centroid), `flux_jy`, `flux_error_jy`, `snr` (‖Σ^{−½}Φx_i‖, the square root of the χ² that the
         island explains; the error of the flux is that of its strength, its shape being known), `pixels` (area) and
-        `fwhm_pixels` (of a circular Gaussian of the same second moments).
+        `fwhm_pixels` (of a circular Gaussian of the same second moments; 0 for a point between pixels, whose pixels have none).
     """
     labels, number = label(model != 0, np.ones((3, 3), int))
     found = []
     for index, box in zip(range(1, number + 1), find_objects(labels)):
         part = np.where(labels[box] == index, model[box], 0).astype(float)
-        size = np.abs(part)
+        # moments of the flux, or of its modulus where both signs cancel
+        size = part if 2 * abs(part.sum()) > np.abs(part).sum() else np.abs(part)
         total = size.sum()
         x, y = (np.arange(s.start, s.stop) for s in box)
         centre = [float(size.sum(axis=1) @ x / total), float(size.sum(axis=0) @ y / total)]
-        spread = size.sum(axis=1) @ (x - centre[0]) ** 2 + size.sum(axis=0) @ (y - centre[1]) ** 2
+        spread = (size.sum(axis=1) @ (x - centre[0]) ** 2 + size.sum(axis=0) @ (y - centre[1]) ** 2) / total
         snr = float(np.sqrt(max(np.vdot(part, _response(part, psf)), 0.0)))
         flux = float(part.sum() * unit_jy)
         found.append(dict(x=centre[0], y=centre[1], flux_jy=flux, flux_error_jy=abs(flux) / max(snr, 1e-30), snr=snr,
                           pixels=int(np.count_nonzero(part)),
-                          fwhm_pixels=float(SIGMA_TO_FWHM * np.sqrt(0.5 * spread / total))))
+                          fwhm_pixels=float(SIGMA_TO_FWHM * np.sqrt(max(0.5 * spread, 0.0)))))
     return sorted(found, key=lambda island: -island["snr"])
 
 

@@ -222,3 +222,9 @@ def test_a_field_that_stands_still_over_the_earth_is_followed_on_the_sky(frame, 
 def test_the_direction_of_a_planet_is_refused_by_name(site):
     with pytest.raises(ValueError, match="vis = 'x.ms': the direction of a field is that of MARS"):
         frames.on_sky(frames.direction_measure("MARS", 0.0, 0.0), Telescope(site[0]), 57174.0 * 86400)
+
+
+@pytest.mark.parametrize("phasecenter", ["TRACKFIELD", "trackfield", "MARS"])
+def test_a_phase_centre_that_moves_is_refused_by_name(phasecenter):
+    with pytest.raises(ValueError, match=f"phasecenter = '{phasecenter}': moving sources cannot be followed: it takes a field"):
+        frames.image_direction(phasecenter, [None])
