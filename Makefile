@@ -61,7 +61,7 @@ $(VENV)/installed: setup.cfg pyproject.toml Makefile
 	$(python) -m pip install --quiet --disable-pip-version-check --editable '.[shell,test]'
 	echo "$$CASA_SITE" > $(VENV)/casasiteconfig.py
 	echo '$(CASA_PTH)' > "$$($(python) -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/casa_sara_casasite.pth"
-	$(python) -m casa_sara.warmup  # compiled now, for this user
+	$(python) -m casa_sara.reconstruction.compile_cache  # compiled now, for this user
 	touch $@
 
 $(VENV)/docs-installed: $(VENV)/installed

@@ -55,13 +55,13 @@ FACTOR, LEAST = 2.0, 0.01  # times the largest scatter, and times this (dB, %), 
 
 def rules() -> dict[str, dict]:
     """Every rule: what of the package is replaced by what."""
-    from casa_sara import problem, reconstruction
-    from casa_sara.outliers import WildSamples
+    from casa_sara.data.outliers import WildSamples
+    from casa_sara.reconstruction import problem, reconstruct
     from casa_sara.solver import l1_weights
     from casa_sara.solver.nnls import NNLS_ITERATIONS
     from casa_sara.solver.point_sources import PointSources
 
-    schedule, iteration = reconstruction.schedule_of, reconstruction.AdaptivePPD
+    schedule, iteration = reconstruct.schedule_of, reconstruct.AdaptivePPD
     reweight, shares, no_samples = l1_weights.reweight, l1_weights._shares, WildSamples(*np.zeros((3, 0), int))
     undivided = lambda ppd, bounds, scale, confined: reweight(ppd, bounds, scale, False)
     no_points = lambda filter_, gradient, model, support, allowed, significance: (support, PointSources())
@@ -131,9 +131,9 @@ def _read(kind, subject, name, folder):
 
 def _part(vis, spw, size, cell_arcsec):
     """The samples of a MeasurementSet in blocks, their density and the grid."""
-    from casa_sara.casa.ms import read_visibilities
-    from casa_sara.casa.weights import sampling_density
-    from casa_sara.imaging import split
+    from casa_sara.casa.ms.read import read_visibilities
+    from casa_sara.casa.ms.weights import sampling_density
+    from casa_sara.imaging.continuum import split
     from casa_sara.options import ImageGrid, Output, Selection
 
     selection = Selection((str(vis),), spw=spw, datacolumn="data")
@@ -145,11 +145,11 @@ def _part(vis, spw, size, cell_arcsec):
 def solved(task: tuple[str, str, str], base: Path) -> dict:
     """Image an observation without a rule, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
-    from casa_sara.casa.weights import dirty_image
+    from casa_sara.casa.ms.weights import dirty_image
     from casa_sara.operators.sky import sky_operator
     from casa_sara.options import SolverOptions
-    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
+    from casa_sara.reconstruction.problem import Samples
 
     rule, kind, name = task
     seen = read(kind, name, base)

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 from casa_sara import tsara
-from casa_sara.resources import resident_memory
+from casa_sara.runtime.machine import resident_memory
 
 CELL_RAD = np.radians(0.5 / 3600)
 SKY = [(1.0, -24 * CELL_RAD, 14 * CELL_RAD), (0.4, 18 * CELL_RAD, -20 * CELL_RAD), (0.2, 4 * CELL_RAD, 3 * CELL_RAD)]
@@ -67,12 +67,12 @@ def long_solution(vis, iterations):
 
     The solver is called directly: the task would have converged long before.
     """
-    from casa_sara.casa.ms import read_visibilities
+    from casa_sara.casa.ms.read import read_visibilities
+    from casa_sara.data.blocks import snapshot_blocks
+    from casa_sara.data.visibilities import sort_into_blocks
     from casa_sara.options import ImageGrid, Selection, SolverOptions
-    from casa_sara.problem import Samples
-    from casa_sara.reconstruction import Control, reconstruct
-    from casa_sara.snapshots import snapshot_blocks
-    from casa_sara.visibilities import sort_into_blocks
+    from casa_sara.reconstruction.problem import Samples
+    from casa_sara.reconstruction.reconstruct import Control, reconstruct
 
     data = read_visibilities(Selection((vis,), datacolumn="data"))
     data, offsets = sort_into_blocks(data, snapshot_blocks(data)[0])

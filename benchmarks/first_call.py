@@ -29,20 +29,20 @@ import casatools
 parts["import casatools"] = time.perf_counter() - mark
 mark = time.perf_counter()
 import casa_sara.private.task_tsara
-from casa_sara import imaging
+from casa_sara.imaging import continuum
 parts["import the other modules"] = time.perf_counter() - mark
 
 def timed(name, label):
-    function = getattr(imaging, name)
+    function = getattr(continuum, name)
     def replacement(*arguments, **options):
         begin = time.perf_counter()
         try:
             return function(*arguments, **options)
         finally:
             parts[label] = parts.get(label, 0.0) + time.perf_counter() - begin
-    setattr(imaging, name, replacement)
+    setattr(continuum, name, replacement)
 
-for name, label in (("foresee", "look at the data, forecast"), ("_read", "read, primary beam"),
+for name, label in (("forecast_run", "look at the data, forecast"), ("_read", "read, primary beam"),
                     ("_point_spread", "weights, PSF, beam; twice"), ("solve_image", "solve"), ("write_products", "write")):
     timed(name, label)
 tsara(vis=sys.argv[1], imagename="image", datacolumn="data", imsize=64, cell="0.2arcsec", overwrite=True)

@@ -25,8 +25,8 @@ import numpy as np
 import real_data
 from machine import machine
 from quality import Case
-from schedule import WIDTH, observed
 from scenes import smoothed_truth
+from schedule import WIDTH, observed
 
 SCENES = ("cyga", "M31", "W28", "3c353", "points off pixels")
 METHODS = ("tsara", "dabbech2018")
@@ -35,9 +35,9 @@ ARCSEC = np.pi / 180 / 3600
 
 def real(name, base):
     """Data in blocks, their density and the grid of a real observation."""
-    from casa_sara.casa.ms import read_visibilities
-    from casa_sara.casa.weights import sampling_density
-    from casa_sara.imaging import split
+    from casa_sara.casa.ms.read import read_visibilities
+    from casa_sara.casa.ms.weights import sampling_density
+    from casa_sara.imaging.continuum import split
     from casa_sara.options import ImageGrid, Output, Selection
 
     case = real_data.Case(name, base)
@@ -61,8 +61,8 @@ def row(name, base, niter):
     """A line of the table for each method."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
+    from casa_sara.reconstruction.problem import Samples
 
     simulated = name in SCENES
     if simulated:

@@ -199,14 +199,14 @@ def table(cell, truth, found, images, seconds):
 
 def convergence(base, truth):
     """Iterations with and without preconditioner and re-weighting, on the X band at the largest cell."""
-    from casa_sara.casa.ms import read_visibilities
-    from casa_sara.casa.weights import sampling_density
-    from casa_sara.noise import noise_from_differences
+    from casa_sara.casa.ms.read import read_visibilities
+    from casa_sara.casa.ms.weights import sampling_density
+    from casa_sara.data.blocks import snapshot_blocks
+    from casa_sara.data.noise import noise_from_differences
+    from casa_sara.data.visibilities import sort_into_blocks
     from casa_sara.options import ImageGrid, Selection, SolverOptions
-    from casa_sara.problem import Samples
-    from casa_sara.reconstruction import Control, reconstruct
-    from casa_sara.snapshots import snapshot_blocks
-    from casa_sara.visibilities import sort_into_blocks
+    from casa_sara.reconstruction.problem import Samples
+    from casa_sara.reconstruction.reconstruct import Control, reconstruct
 
     cell = BANDS["X"][1][0]
     selection = Selection(tuple(str(base / "X/data" / f"{config}.ms") for config in "ABCD"), datacolumn="data")

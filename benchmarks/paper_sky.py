@@ -6,8 +6,8 @@ import numpy as np
 from scipy.ndimage import binary_dilation, map_coordinates
 
 from casa_sara.analysis.metrics import beam_pixels, smooth
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.weights import dirty_image, imaging_weights
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import dirty_image, imaging_weights
 from casa_sara.demo.predict import predict
 from casa_sara.demo.sky import ARCSEC, COMPANION_OFFSET, cyg_a_like
 from casa_sara.operators.measurement import MeasurementOperator

@@ -9,7 +9,7 @@ its own, and its share of what the ranks of a machine have in common.  The model
 
     t = max over ranks of (operator on those that have visibilities + their visibilities + their bases) + sum
 
-with the costs in casa_sara/balance.py, which --costs measures.
+with the costs in casa_sara/imaging/load_balance.py, which --costs measures.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
-from casa_sara.balance import basis_costs, muster, operator_costs
-from casa_sara.casa.census import Census
-from casa_sara.mpi import world
+from iteration import visibilities
+from machine import resident_mb
+
+from casa_sara.casa.ms.data_volume import DataVolume
+from casa_sara.imaging.load_balance import assign_ranks, basis_costs, operator_costs
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator, share_of
 from casa_sara.options import SARA_BASES, ImageGrid, SolverOptions
+from casa_sara.parallel.mpi import world
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from iteration import visibilities
-from machine import resident_mb
 
 CASES = [(1024, 1024, 100_000, 12, 1), (2048, 2048, 1_000_000, 12, 2), (4096, 2048, 2_000_000, 22, 2)]
 LAYOUTS = [(1, 2), (2, 1), (1, 1), (4, 1)]  # ranks, threads of each
@@ -45,29 +46,29 @@ def iteration(case, nthreads, repeat):
     """What one rank does: build its share, iterate, and let rank 0 print what was found."""
     comm, (nx, ny, _, blocks, _) = world(), case
     uv, cell, image, _ = visibilities(case)
-    census = Census(uv.shape[1], tuple(np.abs(uv).max(axis=1)))
-    crew = muster(comm, census, ImageGrid((nx, ny), (cell, cell)), SolverOptions())
-    reader = crew.reader(comm.rank)
+    volume = DataVolume(uv.shape[1], tuple(np.abs(uv).max(axis=1)))
+    ranks = assign_ranks(comm, volume, ImageGrid((nx, ny), (cell, cell)), SolverOptions())
+    reader = ranks.reader(comm.rank)
     if reader is None:
         uv = uv[:, :0]
     else:
-        uv = uv[:, uv.shape[1] * reader // crew.readers : uv.shape[1] * (reader + 1) // crew.readers]
+        uv = uv[:, uv.shape[1] * reader // ranks.readers : uv.shape[1] * (reader + 1) // ranks.readers]
     before = resident_mb()
     measurement = share_of(uv, cell, (nx, ny), eps=1e-5, nthreads=nthreads, comm=comm)
-    dictionary = SaraDictionary((nx, ny), crew.wavelets(SARA_BASES), nthreads=nthreads, n_bases=len(SARA_BASES))
+    dictionary = SaraDictionary((nx, ny), ranks.wavelets(SARA_BASES), nthreads=nthreads, n_bases=len(SARA_BASES))
     vis = measurement.forward(image)
     ppd = AdaptivePPD(measurement, dictionary, vis, np.linspace(0, vis.size, blocks + 1).astype(int),
-                      np.full(vis.size, 0.5, np.float32), float(census.samples), comm=comm)
+                      np.full(vis.size, 0.5, np.float32), float(volume.samples), comm=comm)
     ppd.threshold, ppd.multipliers[:] = 1e-3, 0.1
     ppd.step()
     times, sums = [], []
     for _ in range(repeat):
         times.append(_seconds(comm, ppd.step))
-        sums.append(_seconds(comm, lambda: comm.sum(ppd._data_gradient)))
-    memory = comm.gather(round(resident_mb() - before))
+        sums.append(_seconds(comm, lambda: comm.allreduce(ppd._data_gradient)))
+    memory = comm.allgather(round(resident_mb() - before))
     if comm.rank == 0:
         print("\n" + json.dumps(dict(seconds=statistics.median(times), sum=statistics.median(sums), memory_mb=memory,
-                                     readers=crew.readers, owners=crew.owners)), flush=True)
+                                     readers=ranks.readers, owners=ranks.owners)), flush=True)
 
 
 def _seconds(comm, call):
@@ -92,7 +93,7 @@ def modelled(case, found, ranks):
     """Seconds of the slowest rank by the table of costs, without the sum."""
     uv, cell, _, _ = visibilities(case)
     grid = ImageGrid(case[:2], (cell, cell))
-    fixed, shared = operator_costs(Census(uv.shape[1], tuple(np.abs(uv).max(axis=1))), grid)
+    fixed, shared = operator_costs(DataVolume(uv.shape[1], tuple(np.abs(uv).max(axis=1))), grid)
     bases = basis_costs(SARA_BASES, case[:2])
     owners = np.array(found["owners"] or [0] * len(bases))
     readers = [rank * found["readers"] % ranks < found["readers"] for rank in range(ranks)]
@@ -118,7 +119,7 @@ def compare(case, repeat, rounds):
 
 
 def costs():
-    """The table of casa_sara/balance.py, measured: CPU time, one thread."""
+    """The table of casa_sara/imaging/load_balance.py, measured: CPU time, one thread."""
     shape = (2048, 2048)
     image, out = np.ones(shape, np.float32), np.zeros(shape, np.float32)
     for name in SARA_BASES:
@@ -132,7 +133,7 @@ def costs():
             operator = MeasurementOperator(uv, 1.0, shape, eps=1e-5)
             vis = operator.forward(image)
             seconds = _cpu(lambda: (operator.forward(image, vis), operator.adjoint(vis, out)))
-            table = operator_costs(Census(size, (reach, reach)), ImageGrid(shape, (1.0, 1.0)))
+            table = operator_costs(DataVolume(size, (reach, reach)), ImageGrid(shape, (1.0, 1.0)))
             print(f"operator, reach {reach}, {size} visibilities: {seconds:.4f} s, table {sum(table):.4f} s")
 
 

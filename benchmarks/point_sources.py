@@ -26,8 +26,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 import numpy as np
 from machine import machine
 from quality import Case
-from schedule import WIDTH, observed
 from scenes import replace
+from schedule import WIDTH, observed
 
 FWHM = 2 * np.sqrt(2 * np.log(2))
 EXTENDED = ((3.0, 8, -5, 20.0), (2.0, -15, 10, 12.0), (1.0, 0, 0, 35.0))  # Jy, pixels from the centre, FWHM in pixels
@@ -108,8 +108,8 @@ def solved(scene: Scene, base: Path) -> dict:
     """Image a scene, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
+    from casa_sara.reconstruction.problem import Samples
 
     _, _, part, density, grid = observed(scene.samples_of, base)
     data, offsets, rng = part.data, part.offsets, np.random.default_rng(scene.seed)

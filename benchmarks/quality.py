@@ -219,7 +219,7 @@ def compare_with_longer(cases: list[Case], base: Path) -> None:
     for case in cases:
         folder, found = base / case.folder, cleaned(case, base)
         usual = json.loads((folder / "tsara.json").read_text())["at"]["briggs"]
-        with mock.patch("casa_sara.reconstruction.schedule_of", lambda options: patient):
+        with mock.patch("casa_sara.reconstruction.reconstruct.schedule_of", lambda options: patient):
             longer = run_tsara(case, folder, found, "_longer")["at"]["briggs"]
         print(f"| {case.label} | " + " | ".join(f"{of[beam]:.1f}" for beam in ("0.5", "1.0") for of in (usual, longer)) + " |",
               flush=True)

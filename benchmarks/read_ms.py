@@ -21,7 +21,7 @@ def peak_mb():
         return next(int(line.split()[1]) / 1024 for line in status if line.startswith("VmHWM"))
 
 import casatools
-from casa_sara.casa.ms import read_visibilities
+from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.options import Selection
 
 casatools.logsink().setglobal(False)

@@ -17,12 +17,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from casa_sara.analysis.metrics import smooth
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.weights import dirty_image
-from casa_sara.noise import noise_from_differences
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import dirty_image
+from casa_sara.data.blocks import snapshot_blocks
+from casa_sara.data.noise import noise_from_differences
+from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.operators.measurement import MeasurementOperator
-from casa_sara.snapshots import snapshot_blocks
-from casa_sara.visibilities import sort_into_blocks
 
 __all__ = ["BEAMS", "Observed"]
 

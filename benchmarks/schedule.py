@@ -29,9 +29,9 @@ WIDTH = 1.2  # of the beam, in fringes of the longest baseline
 
 def observed(case: Case, base: Path):
     """Sky and simulation of a case, its data in blocks, their density and the grid: what the task's solver is given."""
-    from casa_sara.casa.ms import read_visibilities
-    from casa_sara.casa.weights import sampling_density
-    from casa_sara.imaging import split
+    from casa_sara.casa.ms.read import read_visibilities
+    from casa_sara.casa.ms.weights import sampling_density
+    from casa_sara.imaging.continuum import split
     from casa_sara.options import ImageGrid, Output, Selection
 
     sky, simulated = simulation_of(case, base / case.folder)
@@ -46,8 +46,8 @@ def solved(case: Case, base: Path) -> dict:
     """Image a case, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.problem import Samples
     from casa_sara.reconstruction import reconstruct
+    from casa_sara.reconstruction.problem import Samples
 
     sky, simulated, part, density, grid = observed(case, base)
     found = reconstruct(Samples(part.data, part.offsets, density, part.noise), grid, SolverOptions(nthreads=1))

@@ -4,5 +4,4 @@ Importing this package needs no CASA and takes milliseconds; a task imports CASA
 """
 
 from casa_sara.tasks import *
-
-__version__ = "0.1.0"
+from casa_sara.version import __version__

@@ -12,11 +12,12 @@ import signal
 import sys
 from unittest import mock
 
-from casa_sara import solving, tsara
-from casa_sara.casa import ms
+from casa_sara import tsara
+from casa_sara.casa.ms import read
+from casa_sara.imaging import run_solver
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 
-ms._CHUNK = 1500  # small pieces, so that all ranks have some
+read._CHUNK = 1500  # small pieces, so that all ranks have some
 RANK = int(os.environ.get("OMPI_COMM_WORLD_RANK", os.environ.get("PMI_RANK", "0")))
 WHEN = 5  # iteration of what goes wrong
 
@@ -43,7 +44,7 @@ def stopped(**parameters):
     def stop_soon():
         yield lambda: RANK == 0 and max(done, default=0) >= WHEN
 
-    with mock.patch.object(solving, "stop_on_interrupt", stop_soon), mock.patch.object(AdaptivePPD, "step", counted):
+    with mock.patch.object(run_solver, "stop_on_interrupt", stop_soon), mock.patch.object(AdaptivePPD, "step", counted):
         return run(**parameters)
 
 

@@ -7,11 +7,11 @@ from simulated_ms import CYGNUS_A, column, edit, simulate
 casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.blockwords import divide, parsed  # noqa: E402
-from casa_sara.casa.ms import read_visibilities  # noqa: E402
-from casa_sara.cautions import suspects  # noqa: E402
+from casa_sara.casa.ms.block_selection import divide, parsed  # noqa: E402
+from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
+from casa_sara.data.visibilities import BlockInfo  # noqa: E402
+from casa_sara.imaging.data_quality import suspects  # noqa: E402
 from casa_sara.options import Selection  # noqa: E402
-from casa_sara.visibilities import BlockInfo  # noqa: E402
 
 CELL_RAD = np.radians(1.0 / 3600)
 NOISE, WORSE = 0.05, 10.0

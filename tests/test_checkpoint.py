@@ -15,18 +15,18 @@ import pytest
 from dense_problem import Problem
 from test_visibilities import observation
 
-from casa_sara.interrupt import stop_on_interrupt
+from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.problem import Samples
-from casa_sara.reconstruction import Control, reconstruct
-from casa_sara.solver import checkpoint as module
+from casa_sara.reconstruction import checkpoint as module
+from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.problem import Samples
+from casa_sara.reconstruction.reconstruct import Control, reconstruct
+from casa_sara.reconstruction.state_file import MAGIC, CheckpointError, read, write
+from casa_sara.runtime.signals import stop_on_interrupt
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.record import CONVERGED, STOPPED_BY_USER, UNFEASIBLE
 from casa_sara.solver.reweighting import Schedule, Stage, solve
-from casa_sara.solver.statefile import MAGIC, CheckpointError, read, write
-from casa_sara.visibilities import sort_into_blocks
 
 HEADER = dict(version="1", parameters=dict(cell=[0.1, 0.1], niter=5), data={}, iteration=3, written=0.0)
 
@@ -304,7 +304,7 @@ def test_a_reconstruction_goes_on_with_all_that_was_found(sky, tmp_path, monkeyp
     path = tmp_path / "c"
     stopped = image(sky, path, 37)
     assert stopped.record.stop_code == STOPPED_BY_USER and stopped.record.iteration[-1] == 37
-    monkeypatch.setattr("casa_sara.problem.nnls", None)  # not needed any more
+    monkeypatch.setattr("casa_sara.reconstruction.problem.nnls", None)  # not needed any more
     updates = [update["iteration"] for update in wanted.record.reweightings]
     releases = np.flatnonzero([update["released"] for update in wanted.record.reweightings])
     middle = updates[releases[0] - 1] + 5  # pixels have asked once to be released

@@ -10,13 +10,20 @@ from simulated_ms import column, edit, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import cube, tsara
-from casa_sara.casa.imageplane import define_image_plane
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.spectralaxis import SpectralAxis, channel_number, channels_of, samples_of_channels, spectral_axis
+from casa_sara import tsara
+from casa_sara.casa.images.image_plane import define_image_plane
+from casa_sara.casa.images.spectral_axis import (
+    SpectralAxis,
+    channel_number,
+    channels_of,
+    samples_of_channels,
+    spectral_axis,
+)
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.imaging import cube
+from casa_sara.imaging.time_forecast import STARTING, Timing
 from casa_sara.options import ImageGrid, Selection
 from casa_sara.solver.record import CONVERGED, TIME_LIMIT
-from casa_sara.timing import STARTING, Timing
 
 ARCSEC = np.pi / 180 / 3600
 GRID = dict(imsize=[64, 60], cell="10arcsec", datacolumn="data", specmode="cube")

@@ -13,19 +13,19 @@ import pywt
 from scipy.optimize import brentq, nnls as scipy_nnls
 from test_visibilities import observation
 
+from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.operators.norms import power_method
 from casa_sara.options import SARA_BASES, ImageGrid, SolverOptions
-from casa_sara.papermethod import block_norms
-from casa_sara.problem import Problem, Samples
-from casa_sara.reconstruction import Control, reconstruct, schedule_of
+from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.paper_method import block_norms
+from casa_sara.reconstruction.problem import Problem, Samples
+from casa_sara.reconstruction.reconstruct import Control, reconstruct, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve
 from casa_sara.solver.paperprior import RELAXATION, PaperPrior
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER
-from casa_sara.visibilities import sort_into_blocks
 
 SHAPE, CELL, LEVELS, TAU = (16, 16), 1e-6, 2, 0.495
 SIZE = SHAPE[0] * SHAPE[1]
@@ -338,7 +338,7 @@ def test_a_reconstruction_is_kept_and_goes_on(blocks, tmp_path, monkeypatch):
     assert wanted.record.residual_norm[0] == pytest.approx(np.linalg.norm(whitened), rel=1e-5)  # x⁽⁰⁾ = 0
     middle = wanted.record.reweightings[1]["iteration"] + 3
     assert image(blocks, tmp_path / "c", middle).record.stop_code == STOPPED_BY_USER
-    monkeypatch.setattr("casa_sara.papermethod.nnls", None)  # not needed any more
+    monkeypatch.setattr("casa_sara.reconstruction.paper_method.nnls", None)  # not needed any more
     found = image(blocks, tmp_path / "c")
     assert found.record.resumed == [middle]
     np.testing.assert_array_equal(found.model, wanted.model)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from simulated_ms import edit, simulate
 
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.weights import dirty_image, imaging_weights, sum_of_weights
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import dirty_image, imaging_weights, sum_of_weights
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, Selection, Weighting
 

@@ -8,16 +8,17 @@ from simulated_ms import edit, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import resources, tsara
-from casa_sara.casa.census import take_census
-from casa_sara.casa.quantities import seconds
-from casa_sara.deadline import Deadline
-from casa_sara.forecast import Workload, forecast
+from casa_sara import tsara
+from casa_sara.casa.ms.data_volume import measure_volume
+from casa_sara.casa.runtime.quantities import seconds
+from casa_sara.imaging.memory_forecast import Workload, forecast
+from casa_sara.imaging.time_forecast import Pace
 from casa_sara.operators._workers import Workers
 from casa_sara.options import Selection
+from casa_sara.runtime import machine
+from casa_sara.runtime.deadline import Deadline
 from casa_sara.solver.nnls import nnls
 from casa_sara.solver.record import CONVERGED, TIME_LIMIT
-from casa_sara.timing import Pace
 
 GRID = dict(imsize=128, cell="0.5arcsec", datacolumn="data", nthreads=1)
 WORK = Workload(1_000_000, (1e6, 9e5), (2048, 1024), (2e-7, 2e-7), 9, 4, 1000, 1)
@@ -50,14 +51,14 @@ def test_dry_run_of_dirty_images_and_existing_images(vis, tmp_path):
 
 def test_run_that_does_not_fit_is_refused_with_what_would(vis, tmp_path, monkeypatch):
     """4000² pixels take 1.9 GB; nothing of it is allocated before the refusal."""
-    from casa_sara import rehearsal
+    from casa_sara.imaging import dry_run
 
-    monkeypatch.setattr(rehearsal, "available_memory", lambda: 10**9)
+    monkeypatch.setattr(dry_run, "available_memory", lambda: 10**9)
     grid = GRID | dict(imsize=4000, cell="0.5arcsec")
-    held = resources.resident_memory()
+    held = machine.resident_memory()
     with pytest.raises(MemoryError, match=r"imsize = \[4000, 4000\].*wavelet duals.*the memory available.*imsize up to"):
         tsara(vis=vis, imagename=str(tmp_path / "huge"), **grid)
-    assert resources.resident_memory() - held < 10**8 and os.listdir(tmp_path) == []
+    assert machine.resident_memory() - held < 10**8 and os.listdir(tmp_path) == []
     dry = tsara(vis=vis, imagename=str(tmp_path / "huge"), dryrun=True, **grid)["forecast"]
     assert not dry["fits"] and "imsize up to" in dry["reason"]
 
@@ -96,7 +97,7 @@ def test_census_counts_what_is_read(vis, tmp_path):
     """Every sample at first, the unflagged ones with the flags; autocorrelations never."""
     import shutil
 
-    from casa_sara.casa.ms import read_visibilities
+    from casa_sara.casa.ms.read import read_visibilities
 
     copy = shutil.copytree(vis, tmp_path / "flagged.ms")
     rng = np.random.default_rng(0)
@@ -105,7 +106,7 @@ def test_census_counts_what_is_read(vis, tmp_path):
     for selection in (Selection((vis, str(copy)), datacolumn="data"),
                       Selection((str(copy),), datacolumn="data", spw="0:1~2", antenna="A03")):
         data = read_visibilities(selection)
-        most, exact = take_census(selection), take_census(selection, flags=True)
+        most, exact = measure_volume(selection), measure_volume(selection, flags=True)
         assert exact.samples == data.size
         assert most.samples == data.size + sum(count for reason, count in data.dropped.items() if "flagged" in reason)
         for reach, axis in zip(exact.reach, data.uvw):
@@ -116,12 +117,12 @@ def test_flags_are_read_before_a_run_is_refused(vis, tmp_path, monkeypatch):
     """A run of which most is flagged fits though it would not with all samples."""
     import shutil
 
-    from casa_sara import rehearsal
+    from casa_sara.imaging import dry_run
 
     copy = shutil.copytree(vis, tmp_path / "flagged.ms")
     edit(copy, "FLAG", lambda flag: flag | (np.arange(flag.shape[-1]) % 10 > 0))
-    full = take_census(Selection((str(copy),), datacolumn="data")).samples
-    monkeypatch.setattr(rehearsal, "forecast", lambda work, *rest: forecast(work, 0, 0 if work.samples == full else 10**12))
+    full = measure_volume(Selection((str(copy),), datacolumn="data")).samples
+    monkeypatch.setattr(dry_run, "forecast", lambda work, *rest: forecast(work, 0, 0 if work.samples == full else 10**12))
     said = tsara(vis=str(copy), imagename=str(tmp_path / "some"), dryrun=True, **GRID)["forecast"]
     assert said["fits"] and said["visibilities"] < 0.2 * full
 
@@ -202,34 +203,34 @@ def _group(folder, **files):
 @pytest.fixture
 def kernel(tmp_path, monkeypatch):
     """A kernel's files of our own: 8 GB available on the machine."""
-    monkeypatch.setattr(resources, "_CGROUPS", tmp_path / "cgroup")
-    monkeypatch.setattr(resources, "_PROC", tmp_path / "proc")
+    monkeypatch.setattr(machine, "_CGROUPS", tmp_path / "cgroup")
+    monkeypatch.setattr(machine, "_PROC", tmp_path / "proc")
     _group(tmp_path / "proc/self", cgroup="0::/user/job\n", statm="100 50 1 1 0 1 0\n")
     _group(tmp_path / "proc", meminfo="MemTotal: 16000000 kB\nMemAvailable: 8000000 kB\n")
     return tmp_path
 
 
 def test_memory_of_the_machine(kernel):
-    assert resources.available_memory() == 8_000_000 * 1024
-    assert resources.resident_memory() == 50 * os.sysconf("SC_PAGE_SIZE")
+    assert machine.available_memory() == 8_000_000 * 1024
+    assert machine.resident_memory() == 50 * os.sysconf("SC_PAGE_SIZE")
     (kernel / "proc/meminfo").unlink()
-    assert resources.available_memory() == os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    assert machine.available_memory() == os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     (kernel / "proc/self/statm").unlink()
-    assert 10**7 < resources.resident_memory() < 10**11
+    assert 10**7 < machine.resident_memory() < 10**11
 
 
 def test_memory_of_control_groups_version_2(kernel):
     _group(kernel / "cgroup/user/job", memory__max="max", memory__current=10**9, memory__stat="inactive_file 5\n")
-    assert resources.available_memory() == 8_000_000 * 1024
+    assert machine.available_memory() == 8_000_000 * 1024
     _group(kernel / "cgroup/user", memory__max=3 * 10**9, memory__current=2 * 10**9,
            memory__stat="anon 7\ninactive_file 500000000\n")
-    assert resources.available_memory() == 1_500_000_000
+    assert machine.available_memory() == 1_500_000_000
     _group(kernel / "cgroup/user/job", memory__max=10**9, memory__current=2 * 10**9, memory__stat="inactive_file 0\n")
-    assert resources.available_memory() == 0
+    assert machine.available_memory() == 0
 
 
 def test_memory_of_control_groups_version_1(kernel):
     (kernel / "proc/self/cgroup").write_text("7:cpu,cpuacct:/\n4:memory:/docker/abc\n0::/\n")
     _group(kernel / "cgroup/memory", memory__limit_in_bytes=4 * 10**9, memory__usage_in_bytes=10**9,
            memory__stat="total_inactive_file 250000000\n")  # inside a container the group's own path is not there
-    assert resources.available_memory() == 3_250_000_000
+    assert machine.available_memory() == 3_250_000_000

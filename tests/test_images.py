@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 from simulated_ms import CYGNUS_A, edit, simulate
 
-from casa_sara.casa import log
-from casa_sara.casa.imageplane import define_image_plane
-from casa_sara.casa.images import read_model, write_image
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.products import (
+from casa_sara.casa.images.image_files import read_model, write_image
+from casa_sara.casa.images.image_plane import define_image_plane
+from casa_sara.casa.images.products import (
     PRODUCTS,
     check_imagename,
     existing_products,
@@ -24,9 +22,11 @@ from casa_sara.casa.products import (
     remove_products,
     write_products,
 )
-from casa_sara.casa.restore import fit_beam, restore, restoring_beam_words
+from casa_sara.casa.images.restore import fit_beam, restore, restoring_beam_words
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.runtime import log
+from casa_sara.imaging.run_solver import _Preparing
 from casa_sara.options import ImageGrid, Output, Selection
-from casa_sara.solving import _Preparing
 
 ARCSEC = np.pi / 180 / 3600
 OFF_CENTRE = "J2000 19h59m40.5s +40d40m02s"

@@ -7,11 +7,11 @@ from astropy.convolution import convolve_fft
 from radio_beam import Beam
 
 from casa_sara.analysis import metrics
-from casa_sara.analysis.points import recovered_point
 from casa_sara.analysis.areas import Frame, region_masks
 from casa_sara.analysis.comparison import Product
 from casa_sara.analysis.measuring import measure, source_support
 from casa_sara.analysis.plots import Column, Zoom, compare
+from casa_sara.analysis.points import recovered_point
 from casa_sara.analysis.residuals import radial_power_spectrum, residual_statistics, whiteness
 
 

@@ -11,9 +11,9 @@ pytest.importorskip("casatools")
 
 from simulated_ms import CYGNUS_A, _tool, add_column, column, direction_cosines, edit, simulate  # noqa: E402
 
-from casa_sara.casa import modelcolumn  # noqa: E402
-from casa_sara.casa.modelcolumn import check_model_column_writable, save_model_column, write_model_column  # noqa: E402
-from casa_sara.casa.ms import read_visibilities  # noqa: E402
+from casa_sara.casa.ms import model_column  # noqa: E402
+from casa_sara.casa.ms.model_column import check_model_column_writable, save_model_column, write_model_column  # noqa: E402
+from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
 from casa_sara.options import Selection  # noqa: E402
 
 SKY = ((1.0, 0.0, 0.0), (0.5, 2e-4, -3e-4))
@@ -79,7 +79,7 @@ def test_model_at_the_fields_centres(copied):
 
 def test_pieces(copied, monkeypatch):
     """Written in pieces of a few rows, the column is the same."""
-    monkeypatch.setattr(modelcolumn, "_CHUNK", 50)
+    monkeypatch.setattr(model_column, "_CHUNK", 50)
     write(copied)
     for number in (0, 1):
         model, data = (spectral_window(copied, column, number) for column in ("MODEL_DATA", "DATA"))
@@ -180,7 +180,7 @@ def test_a_measurement_set_that_is_open_in_the_session(copied):
 
 
 def test_wrong_read_back_is_an_error(copied, monkeypatch):
-    monkeypatch.setattr(modelcolumn, "_read_back", lambda ms: iter([np.zeros(3)]))
+    monkeypatch.setattr(model_column, "_read_back", lambda ms: iter([np.zeros(3)]))
     with pytest.raises(RuntimeError, match="MODEL_DATA of .* does not read back"):
         write(copied)
 

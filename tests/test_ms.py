@@ -22,8 +22,8 @@ from simulated_ms import (  # noqa: E402
     simulate,
 )
 
-from casa_sara.casa.frames import rotation_between  # noqa: E402
-from casa_sara.casa.ms import read_visibilities  # noqa: E402
+from casa_sara.casa.ms.frames import rotation_between  # noqa: E402
+from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
 from casa_sara.options import Selection  # noqa: E402
 
 SHARED = Path(__file__).resolve().parents[2] / "shared/data"

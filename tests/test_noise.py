@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_visibilities import observation
 
-from casa_sara.noise import noise_from_differences
+from casa_sara.data.noise import noise_from_differences
 
 ONE_SCAN = [(0, 0, 1, 0, 120)]
 

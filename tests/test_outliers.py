@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_visibilities import observation
 
-from casa_sara.outliers import find_wild
+from casa_sara.data.outliers import find_wild
 
 FLUX = 10.0
 NOISE = 0.1

@@ -22,101 +22,61 @@ NOT_IMPORTED = {
 CASA = {"casaconfig", "casatools", "casatasks"}
 OF_USERS = {"casampi"}  # CASA's own, used where it is in charge
 
-# What each room may import beside itself and the standard library: other rooms and packages.
-ROOMS = {
-    "__init__": {"casa_sara.tasks"},
-    "tasks": {"casa_sara.private"},
-    "gotasks": {"casa_sara.private", "casa_sara.tasks"},
-    "private": {
-        "casa_sara", "casa_sara.cube", "casa_sara.imaging", "casa_sara.options", "casa_sara.rehearsal", "casa_sara.resources",
-        "casa_sara.solver",
-        "casa_sara.tasks", "casa_sara.analysis", "casa_sara.casa", "casa_sara.compare", "casa_sara.jsonfile",
-        "casa_sara.mpi", "casa_sara.parallel", "numpy", "casashell", "mpi4py", *OF_USERS, *CASA,
-    },
-    "interrupt": set(),
-    "jit": {"numba"},
-    "deadline": set(),
-    "parallel": {"numpy"},
-    "mpi": {"casa_sara.parallel", "numpy", "mpi4py"},
-    "sharing": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
-    "balance": {"casa_sara.operators", "casa_sara.sharing", "numpy"},
-    "problem": {
-        "casa_sara.operators", "casa_sara.options", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing",
-        "casa_sara.solver", "casa_sara.visibilities", "numpy",
-    },
-    "papermethod": {"casa_sara.operators", "casa_sara.options", "casa_sara.problem", "casa_sara.solver", "numpy"},
-    "resources": set(),
+# What each package may import beside itself and the standard library. The order of the packages is held by import-linter
+# (pyproject.toml); this table holds who may use which library, and that no package reaches for more than it needs.
+NUMERICS = {"data", "operators", "solver", "reconstruction", "parallel", "analysis"}
+LIBRARY = NUMERICS - {"analysis"} | {"runtime", "options"}
+OF_CASA = {"casa.ms", "casa.images", "casa.runtime"}
+PACKAGES = {
+    "__init__": {"tasks", "version"},
+    "version": set(),
     "options": set(),
-    "visibilities": {"numpy"},
-    "snapshots": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
-    "levels": {"casa_sara.parallel", "numpy"},
-    "noise": {"casa_sara.levels", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
-    "cautions": {"casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy"},
-    "outliers": {"casa_sara.levels", "casa_sara.noise", "casa_sara.parallel", "casa_sara.sharing", "numpy"},
-    "casa": {
-        "casa_sara", "casa_sara.interrupt", "casa_sara.jsonfile", "casa_sara.levels", "casa_sara.options", "casa_sara.parallel",
-        "casa_sara.sharing", "casa_sara.snapshots", "casa_sara.visibilities", "numpy", "scipy", "astropy", *CASA,
+    "tasks": {"private"},
+    "gotasks": {"private", "tasks"},
+    "private": {
+        "analysis", "comparison", "imaging", "options", "parallel", "runtime", "solver", "version", "numpy", "casashell", "mpi4py",
+        *OF_CASA, *OF_USERS, *CASA,
     },
-    "operators": {
-        "casa_sara.jit", "casa_sara.options", "casa_sara.parallel", "casa_sara.visibilities", "numpy", "scipy", "finufft",
-        "ducc0", "numba", "llvmlite", "pywt",
-    },
-    "solver": {"casa_sara.jit", "casa_sara.options", "casa_sara.parallel", "numpy", "scipy"},
-    "analysis": {"casa_sara.jsonfile", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
-    "jsonfile": set(),
-}
-LIBRARY = (
-    "jit", "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions", "outliers", "problem", "papermethod", "operators", "solver",
-    "analysis",
-)
-ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
-NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
-ROOMS["warmup"] = {"casa_sara.operators", "casa_sara.solver", "llvmlite", "numba", "numpy"}
-ROOMS["forecast"] = {"casa_sara.operators", "casa_sara.sharing"}
-ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
-ROOMS["rehearsal"] = {
-    "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
-}
-ROOMS["solving"] = {
-    "casa_sara", "casa_sara.casa", "casa_sara.deadline", "casa_sara.interrupt", "casa_sara.timing", "numpy", *NUMERICS,
-}
-ROOMS["cubestate"] = {"casa_sara.reconstruction", "casa_sara.solver", "numpy"}
-ROOMS["cube"] = {
-    "casa_sara.casa", "casa_sara.cubestate", "casa_sara.deadline", "casa_sara.imaging", "casa_sara.interrupt",
-    "casa_sara.rehearsal", "casa_sara.solving", "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
-}
-ROOMS["imaging"] = {
-    "casa_sara.casa", "casa_sara.deadline", "casa_sara.forecast", "casa_sara.rehearsal", "casa_sara.solving",
-    "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
-}
-ROOMS["injection"] = {"casa_sara.casa", "casa_sara.solving", "numpy", *NUMERICS}
-ROOMS["compare"] = {"casa_sara", "casa_sara.casa", "casa_sara.injection", "casa_sara.jsonfile", "casa_sara.warmup", "numpy", *NUMERICS}
-ROOMS["demo"] = {
-    "casa_sara", "casa_sara.casa", "casa_sara.compare", "casa_sara.imaging", "casa_sara.resources", "numpy", "finufft",
-    "matplotlib", *NUMERICS,
-    *CASA,
+    "demo": {"__init__", "analysis", "comparison", "options", "runtime", "numpy", "finufft", "matplotlib", *CASA},
+    "comparison": {"analysis", "imaging", "version", "numpy", *OF_CASA, *LIBRARY},
+    "imaging": {"version", "numpy", "scipy", *OF_CASA, *LIBRARY},
+    "casa": set(),
+    "casa.images": {"casa.ms", "casa.runtime", "options", "runtime", "version", "numpy", "scipy", "astropy", *CASA},
+    "casa.ms": {"casa.runtime", "data", "parallel", "runtime", "numpy", "scipy", "astropy", *CASA},
+    "casa.runtime": {"numpy", *CASA},
+    "reconstruction": {"data", "operators", "options", "parallel", "runtime", "solver", "numpy", "numba", "llvmlite"},
+    "solver": {"options", "parallel", "runtime", "numpy", "scipy"},
+    "operators": {"options", "parallel", "runtime", "numpy", "scipy", "finufft", "ducc0", "numba", "llvmlite", "pywt"},
+    "data": {"parallel", "numpy"},
+    "parallel": {"numpy", "mpi4py"},
+    "runtime": {"numba"},
+    "analysis": {"runtime", "numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
 }
 
 
 def imports(module):
-    """Return what a module of the package imports: rooms as casa_sara.<room>, other packages by their name."""
+    """Return what a module of the package imports: packages of casa_sara as in PACKAGES, others by their name."""
     names = set()
     for node in ast.walk(ast.parse((PACKAGE / module).read_text())):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module}: relative import"
-            rooms = {f"casa_sara.{alias.name}" for alias in node.names}
-            if node.module == "casa_sara" and rooms & {f"casa_sara.{name}" for name in ROOMS}:
-                names |= rooms
-            else:
-                names.add(node.module)
-    parts = [name.split(".") for name in names]
-    return {".".join(part[:2]) if part[0] == "casa_sara" else part[0] for part in parts} - sys.stdlib_module_names
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {package_of(name) for name in names} - sys.stdlib_module_names
 
 
-def room(module):
-    return module.split("/")[0].removesuffix(".py")
+def package_of(name):
+    """Return the package of PACKAGES that an imported name belongs to, or the library."""
+    first, *rest = name.split(".")
+    if first != "casa_sara":
+        return first
+    within = [package for package in (".".join(rest[:2]), *rest[:1]) if package in PACKAGES]
+    return within[0] if within else "__init__"
+
+
+def package(module):
+    return package_of("casa_sara." + module.removesuffix(".py").replace("/", "."))
 
 
 def required(section, option):
@@ -127,7 +87,7 @@ def required(section, option):
 
 def test_dependency_table_is_what_is_imported():
     imported = {DISTRIBUTIONS.get(name, name) for module in MODULES for name in imports(module)}
-    imported = {name for name in imported if not name.startswith("casa_sara")}
+    imported -= PACKAGES.keys()
     table = required("options", "install_requires")
     missing = imported - table - OF_USERS
     for extra in ("shell", "mpi"):
@@ -137,9 +97,9 @@ def test_dependency_table_is_what_is_imported():
 
 
 @pytest.mark.parametrize("module", MODULES)
-def test_module_imports_what_its_room_may(module):
-    assert room(module) in ROOMS, "a new room: enter it in ROOMS"
-    assert imports(module) - {f"casa_sara.{room(module)}"} <= ROOMS[room(module)]
+def test_module_imports_what_its_package_may(module):
+    assert package(module) in PACKAGES, "a new package: enter it in PACKAGES"
+    assert imports(module) - {package(module)} <= PACKAGES[package(module)]
 
 
 def test_numerics_never_reach_casa():
@@ -147,9 +107,19 @@ def test_numerics_never_reach_casa():
     reached, new = set(), set(NUMERICS)
     while new:
         reached |= new
-        rooms = {name.removeprefix("casa_sara.") for name in new if name.startswith("casa_sara.")}
-        new = {name for module in MODULES if room(module) in rooms for name in imports(module)} - reached
-    assert not reached & (CASA | {"casashell", "casa_sara.casa", "casa_sara.private"})
+        new = {name for module in MODULES if package(module) in new for name in imports(module)} - reached
+    assert not reached & (CASA | {"casashell", "private"} | OF_CASA)
+
+
+def test_few_loose_modules():
+    """At the top there are packages; what is loose is imported by all of them."""
+    assert {path.name for path in PACKAGE.glob("*.py")} == {"__init__.py", "options.py", "version.py"}
+
+
+def test_packages_say_what_lives_there():
+    """Each begins with a paragraph on what lives there, and what does not."""
+    for path in PACKAGE.rglob("__init__.py"):
+        assert len(ast.get_docstring(ast.parse(path.read_text())) or "") > 40, path
 
 
 def test_changelog_tells_this_version():

@@ -15,13 +15,14 @@ from simulated_ms import edit, pixels, simulate
 pytest.importorskip("casatools")
 
 import mpi_steps
+
 from casa_sara import tsara
-from casa_sara.balance import muster
-from casa_sara.casa import ms as ms_module
-from casa_sara.casa.census import Census
-from casa_sara.mpi import LAUNCHED
+from casa_sara.casa.ms import read as ms_module
+from casa_sara.casa.ms.data_volume import DataVolume
+from casa_sara.imaging.load_balance import assign_ranks
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.parallel import Serial
+from casa_sara.parallel.mpi import LAUNCHED
+from casa_sara.parallel.serial import Serial
 from casa_sara.solver.record import ITERATION_LIMIT, STOPPED_BY_USER
 
 ARCSEC = np.pi / 180 / 3600
@@ -203,14 +204,14 @@ class _Ranks(Serial):
 @pytest.mark.parametrize("samples", [100, 10_000_000])
 def test_work_is_shared_whole_and_evenly(size, samples):
     options, grid = SolverOptions(), ImageGrid((2048, 2048), (1e-6, 1e-6))
-    crew = muster(_Ranks(size), Census(samples, (1e5, 1e5)), grid, options)
-    readers = [crew.reader(rank) for rank in range(size)]
-    assert [number for number in readers if number is not None] == list(range(crew.readers)) and readers[0] == 0
-    assert len(crew.owners) == len(options.wavelets) and set(crew.owners) <= set(range(size))
+    ranks = assign_ranks(_Ranks(size), DataVolume(samples, (1e5, 1e5)), grid, options)
+    readers = [ranks.reader(rank) for rank in range(size)]
+    assert [number for number in readers if number is not None] == list(range(ranks.readers)) and readers[0] == 0
+    assert len(ranks.owners) == len(options.wavelets) and set(ranks.owners) <= set(range(size))
     # many visibilities spread over many ranks; few are not worth a second Fourier transform
-    assert crew.readers == 1 if samples == 100 else crew.readers > size // 2
+    assert ranks.readers == 1 if samples == 100 else ranks.readers > size // 2
 
 
 def test_what_does_not_fit_is_spread_further():
-    options, grid, census = SolverOptions(), ImageGrid((2048, 2048), (1e-6, 1e-6)), Census(100, (1e5, 1e5))
-    assert muster(_Ranks(4), census, grid, options, lambda crew: crew.readers >= 3).readers == 3
+    options, grid, volume = SolverOptions(), ImageGrid((2048, 2048), (1e-6, 1e-6)), DataVolume(100, (1e5, 1e5))
+    assert assign_ranks(_Ranks(4), volume, grid, options, lambda ranks: ranks.readers >= 3).readers == 3

@@ -7,7 +7,7 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from casa_sara.operators.measurement import MeasurementOperator
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel.serial import SERIAL
 from casa_sara.solver.positivity import Release
 
 SHAPE = (24, 20)

@@ -15,10 +15,10 @@ from test_tsara import SKY, _hashes
 
 casatools = pytest.importorskip("casatools")
 
-import casa_sara
-from casa_sara import jsonfile, tsara
-from casa_sara.casa import log
-from casa_sara.solver import checkpoint as checkpoints
+from casa_sara import tsara
+from casa_sara.casa.runtime import log
+from casa_sara.reconstruction import checkpoint as checkpoints
+from casa_sara.runtime import jsonfile
 from casa_sara.solver.record import CONVERGED, STOPPED_BY_USER
 
 GRID = dict(imsize=64, cell="1arcsec", datacolumn="data", nthreads=1, wavelets=["dirac", "db1", "db4"])
@@ -42,10 +42,13 @@ STOPPED = {"interrupted": signal.SIGINT, "terminated": signal.SIGTERM}
 SCRIPT = """
 import json, os, sys
 import casatasks
-from casa_sara import imaging, problem, tsara
-from casa_sara.casa import log, products
+from casa_sara import tsara
+from casa_sara.imaging import continuum
+from casa_sara.reconstruction import problem
+from casa_sara.casa.images import products
+from casa_sara.casa.runtime import log
 from casa_sara.private import task_tsara
-from casa_sara.solver import checkpoint
+from casa_sara.reconstruction import checkpoint
 
 def run(folder, parameters, place, moment, number):
     count = 0
@@ -65,7 +68,7 @@ def run(folder, parameters, place, moment, number):
 
     checkpoint.INTERVAL = checkpoint.PATIENCE = 0  # one after every iteration
     log.Progress = Progress
-    imaging.read_visibilities = watched(imaging.read_visibilities, "read")
+    continuum.read_visibilities = watched(continuum.read_visibilities, "read")
     problem.power_method = watched(problem.power_method, "norm")
     os.replace = watched(os.replace, "checkpoint")
     products._sync = watched(products._sync, "product")  # written, not yet in place
@@ -204,7 +207,7 @@ def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, unint
     edit(other, "DATA", lambda data: data + (np.arange(data.shape[-1]) == 5) * np.complex64(0.01))
     refused("other data: visibilities", vis=other)
     with monkeypatch.context() as patched:
-        patched.setattr(casa_sara, "__version__", "9.9")
+        patched.setattr("casa_sara.imaging.run_solver.__version__", "9.9")
         refused("another version of casa_sara: .* and this is 9.9")
     assert _hashes(path.parent) == before
     for bad in (good[:-1], good[:5000], good[:-20] + bytes([good[-20] ^ 4]) + good[-19:], b""):
@@ -231,7 +234,7 @@ def test_a_second_ctrl_c_aborts_at_once(vis, tmp_path, monkeypatch):
 
 def test_ctrl_c_before_the_first_iteration_leaves_everything(stopped, vis, monkeypatch):
     before = _hashes(Path(stopped).parent)
-    monkeypatch.setattr("casa_sara.problem.nnls", lambda *args, **more: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("casa_sara.reconstruction.problem.nnls", lambda *args, **more: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         tsara(vis=vis, imagename=stopped, overwrite=True, **GRID)
     assert _hashes(Path(stopped).parent) == before

@@ -21,17 +21,19 @@ from test_shell import SCRIPT
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import injection, jsonfile, saracompare, tsara
+from casa_sara import saracompare, tsara
 from casa_sara.analysis import metrics
-from casa_sara.casa.imagesets import read_image_set
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.skyimage import read_header
-from casa_sara.casa.weights import imaging_weights
-from casa_sara.compare import compare_images
+from casa_sara.casa.images.image_sets import read_image_set
+from casa_sara.casa.images.sky_image import read_header
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import imaging_weights
+from casa_sara.comparison import injection
+from casa_sara.comparison.compare_images import compare_images
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
+from casa_sara.private.parameters import SARACOMPARE, TSARA
+from casa_sara.runtime import jsonfile
 from casa_sara.solver.record import STOPPED_BY_USER
-from casa_sara.tasks import saracompare as compare_task
-from casa_sara.tasks import tsara as tsara_task
+from casa_sara.tasks import saracompare as compare_task, tsara as tsara_task
 
 ARCSEC = np.radians(1 / 3600)
 CENTRE = (np.radians(299.86875), np.radians(40 + 44 / 60 + 2 / 3600))  # of the simulated observation
@@ -624,8 +626,8 @@ def test_overwrite_replaces_the_report_and_leaves_other_files(tmp_path):
 
 
 def test_parameters_of_the_selection_are_tsaras():
-    theirs = {parameter.name: parameter for parameter in sys.modules["casa_sara.tasks.tsara"].PARAMETERS}
-    ours = {parameter.name: parameter for parameter in sys.modules["casa_sara.tasks.saracompare"].PARAMETERS}
+    theirs = {parameter.name: parameter for parameter in TSARA}
+    ours = {parameter.name: parameter for parameter in SARACOMPARE}
     assert set(Selection.PARAMETERS) <= ours.keys() and tsara_task is not compare_task
     for name in (*Selection.PARAMETERS, "selectdata", "datacolumn"):
         assert ours[name]._replace(summary="") == theirs[name]._replace(summary=""), name

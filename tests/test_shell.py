@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 
 from casa_sara.private import shelltask
-from casa_sara.tasks.tsara import PARAMETERS
+from casa_sara.private.parameters import TSARA
 
-BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+BY_NAME = {parameter.name: parameter for parameter in TSARA}
 pytestmark = pytest.mark.skipif(find_spec("casashell") is None, reason="casashell is not installed")
 
 STARTUP = """
@@ -37,7 +37,7 @@ json.dump(records, open("records.json", "w"))
 """
 
 CELLS = {
-    "collisions": f"[name for name in {[p.name for p in PARAMETERS]} if name in globals()]",
+    "collisions": f"[name for name in {[p.name for p in TSARA]} if name in globals()]",
     "inp": "inp tsara",
     "inp by name": "inp('tsara')",
     "wrong": "vis = 'nosuch.ms'",
@@ -112,8 +112,8 @@ def test_inp_shows_the_defaults_and_the_open_sub_parameters(shell):
     records, _ = shell
     text = records["inp"]["printed"]
     assert text.startswith("# tsara -- Image MeasurementSets")
-    defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
-    assert shown(text) == {p.name: repr(p.default) for p in PARAMETERS if p.is_open(defaults)}
+    defaults = {parameter.name: parameter.default for parameter in TSARA}
+    assert shown(text) == {p.name: repr(p.default) for p in TSARA if p.is_open(defaults)}
     assert "\n   field " in text and "\nweighting " in text
     assert records["inp by name"]["printed"] == text
 
@@ -121,7 +121,7 @@ def test_inp_shows_the_defaults_and_the_open_sub_parameters(shell):
 def test_inp_describes_every_parameter_within_the_terminal(shell):
     lines = shell[0]["inp"]["printed"].splitlines()
     described = " ".join(" ".join(line.split("#", 1)[1] for line in lines if "#" in line).split())
-    for parameter in PARAMETERS:
+    for parameter in TSARA:
         if f"\n{parameter.name} " in shell[0]["inp"]["printed"]:
             assert parameter.summary in described
     assert max(map(len, lines)) <= 110
@@ -141,11 +141,11 @@ def test_go_raises_what_is_wrong(shell):
 
 def test_go_runs_with_the_variables(shell):
     values = shell[0]["go"]["result"]
-    assert values.keys() == {parameter.name for parameter in PARAMETERS}
+    assert values.keys() == {parameter.name for parameter in TSARA}
     assert (values["vis"], values["weighting"], values["robust"]) == ("data.ms", "briggs", -1.0)
     assert (values["imsize"], values["cell"], values["l2bound"]) == ([64, 32], ["0.1arcsec"], [1.5])
     set_ = {"vis", "imagename", "cell", "databound", "l2bound", "weighting", "robust", "imsize"}
-    assert all(values[p.name] == p.default for p in PARAMETERS if p.name not in set_)
+    assert all(values[p.name] == p.default for p in TSARA if p.name not in set_)
 
 
 def test_hidden_sub_parameter_has_its_default(shell):
@@ -156,14 +156,14 @@ def test_hidden_sub_parameter_has_its_default(shell):
 
 def test_call_takes_defaults_and_not_the_variables(shell):
     values = shell[0]["call"]["result"]
-    defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
+    defaults = {parameter.name: parameter.default for parameter in TSARA}
     assert values == defaults | {"vis": "data.ms", "imagename": "other", "cell": "2arcsec"}
     assert shell[0]["call wrong"]["error"] == "ValueError"
 
 
 def test_tput_and_saveinputs_write_all_parameters(shell):
     values = saved(shell[1] / "mine.txt")
-    assert list(values) == [parameter.name for parameter in PARAMETERS]
+    assert list(values) == [parameter.name for parameter in TSARA]
     assert values | {"vis": "data.ms", "robust": -1.0, "imsize": [64, 32], "cell": ["0.1arcsec"]} == values
     text = (shell[1] / "mine.txt").read_text().splitlines()
     assert text[-1].startswith("#tsara(vis='data.ms', ")
@@ -195,7 +195,7 @@ def test_taskhelp_lists_the_task(shell):
 
 def test_question_mark_tells_every_parameter(shell):
     text = textwrap.dedent(shell[0]["help"]["printed"])
-    for parameter in PARAMETERS:
+    for parameter in TSARA:
         assert f"{parameter.name} : " in text
 
 

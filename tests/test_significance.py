@@ -7,13 +7,15 @@ from scipy.optimize import nnls
 from scipy.signal import convolve2d
 from test_visibilities import observation
 
+from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.problem import Samples
-from casa_sara.reconstruction import Control, reconstruct
+from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.problem import Samples
+from casa_sara.reconstruction.reconstruct import Control, reconstruct
+from casa_sara.reconstruction.state_file import read, write
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from casa_sara.solver.checkpoint import Checkpoint
 from casa_sara.solver.convolution import convolve_valid
 from casa_sara.solver.islands import islands_of, look_at
 from casa_sara.solver.l1_weights import band_noise, first_weights, reweight
@@ -23,9 +25,7 @@ from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, STOPPED_BY_USER, STRUCTURED, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, solve
 from casa_sara.solver.significance import SignificantSupport, gradient_image, matched_filter
-from casa_sara.solver.statefile import read, write
 from casa_sara.solver.unresolved import unresolved
-from casa_sara.visibilities import sort_into_blocks
 
 CELL = 1e-6
 BEAM = 3.5  # FWHM in pixels of what samples of this spread see

@@ -9,10 +9,10 @@ from simulated_ms import column, edit, pixels, simulate
 casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.skyimage import read_sky_image
-from casa_sara.casa.spectrum import spectral_band, with_spectrum
-from casa_sara.compare import compare_images
+from casa_sara.casa.images.sky_image import read_sky_image
+from casa_sara.casa.images.spectral_index import spectral_band, with_spectrum
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.comparison.compare_images import compare_images
 from casa_sara.operators.sky import further_bytes, sky_operator
 from casa_sara.options import Comparing, ImageGrid, Selection, Spectrum
 

@@ -8,7 +8,7 @@ from simulated_ms import pixels, simulate
 casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara  # noqa: E402
-from casa_sara.cautions import beyond_baselines, check_confined, left_outside  # noqa: E402
+from casa_sara.imaging.data_quality import beyond_baselines, check_confined, left_outside  # noqa: E402
 from casa_sara.solver.adaptive_ppd import AdaptivePPD  # noqa: E402
 from casa_sara.solver.l2_bounds import GivenBounds  # noqa: E402
 from casa_sara.solver.nnls import nnls  # noqa: E402

@@ -11,7 +11,8 @@ from simulated_ms import edit, pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import jsonfile, tsara
+from casa_sara import tsara
+from casa_sara.runtime import jsonfile
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER
 
 CELL_RAD = np.radians(1.0 / 3600)
@@ -187,7 +188,7 @@ def test_a_failed_run_leaves_the_old_products(run, vis, tmp_path, monkeypatch):
     for product in PRODUCTS:
         shutil.copytree(f"{run[1]}.{product}", f"{name}.{product}")
     before = _hashes(tmp_path)
-    monkeypatch.setattr("casa_sara.imaging.sum_of_weights", lambda *args: "not a number")
+    monkeypatch.setattr("casa_sara.imaging.continuum.sum_of_weights", lambda *args: "not a number")
     with pytest.raises(ValueError, match="not a number"):
         tsara(vis=vis, imagename=name, overwrite=True, niter=0, **GRID)
     assert _hashes(tmp_path) == before
@@ -230,7 +231,7 @@ def test_ctrl_c_ends_with_the_best_image_so_far(vis, tmp_path, monkeypatch):
     import os
     import signal
 
-    from casa_sara.casa import log
+    from casa_sara.casa.runtime import log
 
     class Interrupting(log.Progress):
         def __call__(self, iteration, message, fraction=None):

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from casa_sara import snapshots as module
-from casa_sara.snapshots import snapshot_blocks
-from casa_sara.visibilities import RowTable, Visibilities, sort_into_blocks
+from casa_sara.data import blocks as module
+from casa_sara.data.blocks import snapshot_blocks
+from casa_sara.data.visibilities import RowTable, Visibilities, sort_into_blocks
 
 
 def observation(scans, baselines=10, channels=1, interval=10.0, seed=0):

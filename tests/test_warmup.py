@@ -12,7 +12,7 @@ PROGRAM = """
 import gc, sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from casa_sara.warmup import use_every_kernel
+from casa_sara.reconstruction.compile_cache import use_every_kernel
 
 def loaded():
     return {(one.py_func.__module__, one.py_func.__name__): len(one.signatures)
@@ -23,9 +23,9 @@ if sys.argv[1] == "warm":
 before = loaded()
 
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.problem import Samples
+from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction import reconstruct
-from casa_sara.visibilities import RowTable, Visibilities
+from casa_sara.data.visibilities import RowTable, Visibilities
 
 rng = np.random.default_rng(5)
 rows = 60
@@ -59,26 +59,26 @@ def test_a_run_needs_no_kernel_that_was_not_loaded():
 
 COMPILE = """
 from numba.core import event
-from casa_sara import warmup
+from casa_sara.reconstruction import compile_cache
 {change}
 with event.install_recorder("numba:compile") as recorder:
-    warmup.compile_kernels()
-print([str(warmup._mark()), len(recorder.buffer)])
+    compile_cache.compile_kernels()
+print([str(compile_cache._mark()), len(recorder.buffer)])
 """
 LOADED = """
 from numba.core import event
-from casa_sara.warmup import kernels_loading
+from casa_sara.reconstruction.compile_cache import kernels_loading
 said = []
 with event.install_recorder("numba:compile") as recorder, kernels_loading(said.append):
     pass
 print([said, len(recorder.buffer)])
 """
 WITHOUT = """
-from casa_sara import warmup
-said, warmup.compile_kernels = [], lambda: None
-with warmup.kernels_loading(said.append):
+from casa_sara.reconstruction import compile_cache
+said, compile_cache.compile_kernels = [], lambda: None
+with compile_cache.kernels_loading(said.append):
     pass
-print([warmup._mark(), said])
+print([compile_cache._mark(), said])
 """
 
 
@@ -136,7 +136,7 @@ def test_a_helper_that_is_killed_is_made_up_for(cache, tmp_path):
     for path in (tmp_path / "numba").rglob("*"):
         if path.name.startswith(("_wavelet", "casa_sara")):
             path.unlink()
-    kill = "wait = warmup._wait_for; warmup._wait_for = lambda helper: (helper.kill(), wait(helper))"
+    kill = "wait = compile_cache._wait_for; compile_cache._wait_for = lambda helper: (helper.kill(), wait(helper))"
     mark = Path(eval(output(start(COMPILE.format(change=kill), tmp_path / "numba")))[0])
     assert mark.exists() and list(mark.parent.glob("_wavelet_kernels.transform*.nbc"))
 

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from simulated_ms import CYGNUS_A, SPEED_OF_LIGHT, edit, simulate
 
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.casa.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import dirty_image, imaging_weights, sampling_density, sum_of_weights
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.options import ImageGrid, Selection, Weighting
 

@@ -13,9 +13,9 @@ from simulated_ms import CYGNUS_A, column, pixels, simulate
 casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara
-from casa_sara.casa.census import take_census
-from casa_sara.casa.ms import read_visibilities
-from casa_sara.compare import compare_images
+from casa_sara.casa.ms.data_volume import measure_volume
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.comparison.compare_images import compare_images
 from casa_sara.operators import widefield
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
 from casa_sara.operators.sky import further_bytes
@@ -281,8 +281,8 @@ def test_dry_run_knows_of_the_w_term(vis, tmp_path):
     plain, wide = (tsara(vis=vis, imagename=str(tmp_path / "none"), dryrun=True, gridder=gridder, **GRID)["forecast"]
                    for gridder in ("standard", "wproject"))
     parts = [said["memory_bytes"]["iterating"]["operator"] for said in (plain, wide)]
-    census, data = (take(Selection((vis,), datacolumn="data")) for take in (take_census, read_visibilities))
-    assert data.max_w <= census.max_w < 1.01 * data.max_w
+    volume, data = (take(Selection((vis,), datacolumn="data")) for take in (measure_volume, read_visibilities))
+    assert data.max_w <= volume.max_w < 1.01 * data.max_w
     grid = ImageGrid((FIELD, FIELD), (CELL_RAD, CELL_RAD), gridder="wproject")
-    assert parts[1] - parts[0] == further_bytes(census.samples, grid, census.max_w)
+    assert parts[1] - parts[0] == further_bytes(volume.samples, grid, volume.max_w)
     assert wide["seconds"]["pair"] > 3 * plain["seconds"]["pair"]

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """Generate the plain and the shell task of every xml/*.xml.
 
-    xml2task.py           write casa_sara/tasks/ and casa_sara/gotasks/
+    xml2task.py           write casa_sara/tasks/, casa_sara/gotasks/ and casa_sara/private/parameters.py
     xml2task.py --check   write nothing; name the files that are not what the XML says, exit 1
 
 taskxml.py describes the XML, and refuses what it does not know.
@@ -23,14 +23,10 @@ LINE_LENGTH = 120
 def plain_task(task: Task) -> str:
     """Return the module of the plain task."""
     signature = _wrapped("    def __call__(", ["self", *(f"{p.name}={p.default!r}" for p in task.params)], "):")
-    parameters = "".join(f"    {_parameter(param)},\n" for param in task.params)
     return f'''"""The task {task.name}. {HEADER.format(task.name)}"""
 
+from casa_sara.private.parameters import {task.name.upper()}
 from casa_sara.private.plaintask import run_task
-from casa_sara.private.validation import Parameter
-
-PARAMETERS = (
-{parameters})
 
 
 class _{task.name}:
@@ -48,7 +44,7 @@ class _{task.name}:
         del values["self"]
         from casa_sara.private.task_{task.name} import {task.name} as implementation
 
-        return run_task({task.name!r}, PARAMETERS, implementation, values)
+        return run_task({task.name!r}, {task.name.upper()}, implementation, values)
 
 
 {task.name} = _{task.name}()
@@ -60,8 +56,8 @@ def shell_task(task: Task) -> str:
     signature = _wrapped("    def __call__(", ["self", *(f"{p.name}=None" for p in task.params)], "):")
     return f'''"""The task {task.name} for the CASA shell. {HEADER.format(task.name)}"""
 
+from casa_sara.private.parameters import {task.name.upper()}
 from casa_sara.private.shelltask import ShellTask
-from casa_sara.tasks.{task.name} import PARAMETERS
 from casa_sara.tasks.{task.name} import {task.name} as _task
 
 
@@ -77,8 +73,18 @@ class _{task.name}(ShellTask):
         return self._run(given)
 
 
-{task.name} = _{task.name}({task.name!r}, PARAMETERS, _task)
+{task.name} = _{task.name}({task.name!r}, {task.name.upper()}, _task)
 '''
+
+
+def parameter_tables(tasks: list[Task]) -> str:
+    """Return the module with the parameters of all tasks."""
+    head = f'"""The parameters of the tasks. {HEADER.format("*")}"""\n\nfrom casa_sara.private.validation import Parameter\n'
+    tables = []
+    for task in tasks:
+        parameters = "".join(f"    {_parameter(param)},\n" for param in task.params)
+        tables.append(f"\n{task.name.upper()} = (\n{parameters})\n")
+    return head + "".join(tables)
 
 
 def package(names: list[str], folder: str, text: str, register: bool) -> str:
@@ -143,6 +149,7 @@ def generate(xml_folder: Path) -> dict[str, str]:
     names = [task.name for task in tasks]
     files = {
         "tasks/__init__.py": package(names, "tasks", "The tasks, for Python.", register=False),
+        "private/parameters.py": parameter_tables(tasks),
         "gotasks/__init__.py": package(names, "gotasks", "The tasks, for the CASA shell.", register=True),
     }
     for task in tasks:
@@ -166,6 +173,8 @@ def main(arguments: list[str] | None = None) -> int:
     package_folder = options.root / "casa_sara"
     there = {f"{folder}/{path.name}": path.read_text()
              for folder in ("tasks", "gotasks") for path in (package_folder / folder).glob("*.py")}
+    tables = package_folder / "private" / "parameters.py"
+    there |= {"private/parameters.py": tables.read_text()} if tables.exists() else {}
     stale = sorted(name for name in files.keys() | there.keys() if files.get(name) != there.get(name))
     if options.check:
         for name in stale:

@@ -10,13 +10,13 @@ import jinja2
 import numpy as np
 from PIL import Image
 
-from casa_sara import jsonfile
 from casa_sara.analysis import animation, convergence, diagnostics, pages
 from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.folder import MEASURES, PAGE, replaced
 from casa_sara.analysis.sheets import DPI
 from casa_sara.analysis.tables import tables
 from casa_sara.analysis.zooms import find_zooms
+from casa_sara.runtime import jsonfile
 
 __all__ = ["Picture", "write_report"]
 

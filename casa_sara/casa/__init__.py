@@ -1,1 +1,4 @@
-"""Everything that uses CASA's tools: reading data, weights, writing images and the model column."""
+"""All that touches CASA's tools and tables, in three rooms: MeasurementSets (`ms`), images (`images`), the process (`runtime`).
+
+Visibilities leave it as arrays (:mod:`casa_sara.data`), images enter it as arrays; nothing here knows the solver.
+"""

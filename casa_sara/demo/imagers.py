@@ -88,9 +88,9 @@ def write_comparison(case: Case, **more) -> tuple[str, Path]:
     """
     from casa_sara.analysis.report import write_report
     from casa_sara.analysis.tables import as_text
-    from casa_sara.compare import compare_images
+    from casa_sara.comparison.compare_images import compare_images
     from casa_sara.options import Comparing, Selection
-    from casa_sara.resources import available_cores
+    from casa_sara.runtime.machine import available_cores
 
     roots = tuple(str(case.folder / name) for name in ("tsara", "tclean_briggs", "tclean_natural"))
     request = Comparing(roots, ("tsara", *TCLEAN_WEIGHTINGS), **more, nthreads=available_cores())

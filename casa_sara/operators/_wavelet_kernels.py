@@ -12,12 +12,26 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from casa_sara import jit
 from casa_sara.operators._simd import MAX_TAPS, VECTOR_BYTES
 from casa_sara.operators._wavelet_lines import (
-    CLIP, CLIP_WEIGHTED, HALO, KEEP, SCRATCH_ROWS, TABLE_SIZE, Place, analyse_along, analyse_lines, compiled, late,
-    synthesise_along, synthesise_lines, tabulate, update_pixels, wrap,
+    CLIP,
+    CLIP_WEIGHTED,
+    HALO,
+    KEEP,
+    SCRATCH_ROWS,
+    TABLE_SIZE,
+    Place,
+    analyse_along,
+    analyse_lines,
+    compiled,
+    late,
+    synthesise_along,
+    synthesise_lines,
+    tabulate,
+    update_pixels,
+    wrap,
 )
+from casa_sara.runtime import jit
 
 CHUNK = 16  # lines of level 1 done in one go
 MARGIN = MAX_TAPS // 2 - 1  # image lines needed before those of a chunk

@@ -15,11 +15,25 @@ from typing import NamedTuple
 
 from numba.extending import register_jitable
 
-from casa_sara import jit
 from casa_sara.operators._simd import (
-    MAX_TAPS, VECTOR_BYTES, evens, filter_bank, lane_bytes, load, load_first, maximum, minimum, odds, prefetch, splat,
-    store, store_first, zip_high, zip_low,
+    MAX_TAPS,
+    VECTOR_BYTES,
+    evens,
+    filter_bank,
+    lane_bytes,
+    load,
+    load_first,
+    maximum,
+    minimum,
+    odds,
+    prefetch,
+    splat,
+    store,
+    store_first,
+    zip_high,
+    zip_low,
 )
+from casa_sara.runtime import jit
 
 __all__ = ["KEEP", "CLIP", "CLIP_WEIGHTED", "HALO", "SCRATCH_ROWS", "TABLE_SIZE", "Place", "compiled",
            "late", "tabulate", "wrap", "update_pixels", "analyse_lines", "analyse_along", "synthesise_lines",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from casa_sara import jit
+from casa_sara.runtime import jit
 
 __all__ = ["RING_ROWS", "neighbourhood_weights"]
 

@@ -17,9 +17,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from casa_sara import jit
 from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import load, multiply_add, store, zeros
+from casa_sara.runtime import jit
 
 __all__ = ["AxisDecimation", "Separable", "decimate", "expand", "expand_rows", "scratch_shape", "separable"]
 

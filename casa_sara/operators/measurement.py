@@ -22,10 +22,9 @@ import numpy as np
 import numpy.typing as npt
 
 from casa_sara.operators._workers import Workers
-from casa_sara.operators.decimation import (
-    AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable)
+from casa_sara.operators.decimation import AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable
 from casa_sara.operators.nufft import NonUniformFFT, memory_size
-from casa_sara.parallel import SERIAL, Serial
+from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "check_cell", "check_field", "choose_eps", "grid_bytes", "share_of"]
 
@@ -200,7 +199,7 @@ class Summed:
         -------
         real (nx, ny)
         """
-        return self._comm.sum(self._measurement.adjoint(vis, out))
+        return self._comm.allreduce(self._measurement.adjoint(vis, out))
 
 
 def share_of(uv: np.ndarray, *arguments: Any, comm: Serial = SERIAL,
@@ -213,7 +212,7 @@ def share_of(uv: np.ndarray, *arguments: Any, comm: Serial = SERIAL,
         Baselines of this rank's visibilities in wavelengths; M may be 0.
     *arguments, **options
         As of :class:`MeasurementOperator`.
-    comm : casa_sara.parallel.Serial or MPI
+    comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the visibilities are spread.
 
     Returns
@@ -324,7 +323,7 @@ def choose_eps(vis: np.ndarray, weight: np.ndarray, dtype: npt.DTypeLike = np.fl
         Inverse variance of the real part and of the imaginary part, 1/Jy².
     dtype : float32 or float64
         Of the operator.
-    comm : casa_sara.parallel.Serial or MPI
+    comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the visibilities are spread.
 
     Returns
@@ -332,5 +331,5 @@ def choose_eps(vis: np.ndarray, weight: np.ndarray, dtype: npt.DTypeLike = np.fl
     float
         At most 1e-4, and not less than the operator can.
     """
-    peak, total = comm.sum(np.array([np.sum(values, dtype=np.float64) for values in (weight * np.abs(vis), weight)]))
+    peak, total = comm.allreduce(np.array([np.sum(values, dtype=np.float64) for values in (weight * np.abs(vis), weight)]))
     return float(np.clip(np.sqrt(total) / max(peak, 1e-300), SMALLEST_EPS[np.dtype(dtype)], LARGEST_EPS))

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import iv, jv
 
-from casa_sara import jit
+from casa_sara.runtime import jit
 
 __all__ = ["ModulatedOperator", "bessel_factors", "terms_needed"]
 

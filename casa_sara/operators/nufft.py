@@ -24,11 +24,18 @@ import numpy as np
 import numpy.typing as npt
 import scipy.fft
 
-from casa_sara import jit
 from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import (
-    gather_rows, multiply, pair_sums, polynomials, scale_pairs, scatter_rows, second_half_twice)
+    gather_rows,
+    multiply,
+    pair_sums,
+    polynomials,
+    scale_pairs,
+    scatter_rows,
+    second_half_twice,
+)
 from casa_sara.operators._workers import Workers
+from casa_sara.runtime import jit
 
 __all__ = ["NonUniformFFT", "memory_size"]
 

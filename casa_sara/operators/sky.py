@@ -20,7 +20,7 @@ from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, N
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
 from casa_sara.operators.widefield import WGridder, WTerm, w_operator
 from casa_sara.options import LARGEST_INDEX, ImageGrid
-from casa_sara.parallel import SERIAL, Serial
+from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["further_bytes", "sky_operator"]
 
@@ -45,7 +45,7 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid, freq_hz: np.ndarray | None = 
         Frequencies; without them the sky is as bright at all frequencies as at the reference.
     row_scale, eps, dtype, nthreads
         As of :class:`casa_sara.operators.measurement.MeasurementOperator`, whose interface the result has.
-    comm : casa_sara.parallel.Serial or MPI
+    comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the visibilities are spread; the result is of this rank's.
     """
     def of_place(row_scale, eps):

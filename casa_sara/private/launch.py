@@ -7,8 +7,8 @@ import os
 from collections.abc import Callable
 from typing import Any
 
-from casa_sara.casa import log
-from casa_sara.mpi import MPI, world
+from casa_sara.casa.runtime import log
+from casa_sara.parallel.mpi import MPI, world
 
 __all__ = ["in_parallel", "serve"]
 
@@ -26,15 +26,14 @@ def in_parallel(run: Callable, parameters: dict[str, Any]) -> dict[str, Any]:
     """
     servers = _servers()
     if servers:
-        return _push(servers, parameters)
+        return _push(servers, run, parameters)
     return _run_on(world(), run, parameters)
 
 
-def serve(parameters: dict[str, Any], servers: list[int], folder: str) -> tuple[Any, BaseException | None]:
+def serve(run: Callable, parameters: dict[str, Any], servers: list[int],
+          folder: str) -> tuple[Any, BaseException | None]:
     """Run the task on casampi's servers: what the client has each of them call. Errors are returned, not raised."""
     from mpi4py import MPI as mpi
-
-    from casa_sara.private.task_tsara import run
 
     os.chdir(folder)
     group = mpi.COMM_WORLD.Get_group().Incl(servers)
@@ -62,14 +61,15 @@ def _servers():
     return MPIEnvironment.mpi_server_rank_list() if MPIEnvironment.is_mpi_enabled else []
 
 
-def _push(servers, parameters):
+def _push(servers, run, parameters):
     """Have the servers run the task, as tclean does, and return what the first of them returns."""
     from casampi.MPICommandClient import MPICommandClient
 
     client = MPICommandClient()
     client.set_log_mode("redirect")
     client.start_services()
-    command = f"__import__('casa_sara.private.launch', fromlist=['serve']).serve({parameters!r}, {servers!r}, {os.getcwd()!r})"
+    task = f"__import__({run.__module__!r}, fromlist=[{run.__name__!r}]).{run.__name__}"
+    command = f"__import__({__name__!r}, fromlist=['serve']).serve({task}, {parameters!r}, {servers!r}, {os.getcwd()!r})"
     answers = client.push_command_request(command, block=True, target_server=servers)
     failed = [answer for answer in answers if not answer["successful"]]
     if failed:

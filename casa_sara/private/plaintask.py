@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from casa_sara.casa import log
+from casa_sara.casa.runtime import log
 from casa_sara.private.validation import Parameter, validate
 
 __all__ = ["run_task"]

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-import casa_sara
 from casa_sara.solver.record import ITERATION_LIMIT, STOP_DESCRIPTIONS
+from casa_sara.version import __version__
 
 __all__ = ["cube_summary", "summary"]
 
@@ -30,7 +30,7 @@ def summary(result, options, full: bool = False) -> dict[str, Any]:
 
     Parameters
     ----------
-    result : casa_sara.imaging.Result
+    result : casa_sara.imaging.continuum.Result
     options : casa_sara.options.SolverOptions
     full : bool
         Add the history of every iteration.
@@ -55,7 +55,7 @@ def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
 
     Parameters
     ----------
-    result : casa_sara.cube.CubeResult
+    result : casa_sara.imaging.cube.CubeResult
     options : casa_sara.options.SolverOptions
     full : bool
         Add the history of every iteration.
@@ -73,7 +73,7 @@ def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
             ends += [done + end for end in minor[number][0]["iterDone"]]
             done = ends[-1] if ends else 0
     sara = {
-        "version": casa_sara.__version__,
+        "version": __version__,
         "method": options.method,
         "visibilities": result.data.size,
         "dropped": dict(result.data.dropped),
@@ -137,7 +137,7 @@ def _minor(result, code):
 def _sara(result, options, full):
     data = result.data
     sara = {
-        "version": casa_sara.__version__,
+        "version": __version__,
         "method": options.method,
         "visibilities": result.size,
         "dropped": dict(data.dropped),

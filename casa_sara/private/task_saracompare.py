@@ -6,15 +6,15 @@ import os
 from pathlib import Path
 from typing import Any
 
-import casa_sara
 from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.folder import MEASURES, PAGE, in_the_way
-from casa_sara.casa import log
-from casa_sara.compare import compare_images
+from casa_sara.casa.runtime import log
+from casa_sara.comparison.compare_images import compare_images
 from casa_sara.options import Comparing, Selection
+from casa_sara.private.parameters import SARACOMPARE
 from casa_sara.private.task_tsara import selection_of
-from casa_sara.resources import available_cores
-from casa_sara.tasks.saracompare import PARAMETERS
+from casa_sara.runtime.machine import available_cores
+from casa_sara.version import __version__
 
 __all__ = ["saracompare"]
 
@@ -24,7 +24,7 @@ OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust", "inject", "injectflux")
 
 def saracompare(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return the measures."""
-    log.info(f"casa_sara {casa_sara.__version__}")
+    log.info(f"casa_sara {__version__}")
     selection = _selection(parameters)
     folder = _folder(parameters["outdir"], parameters["overwrite"])
     models, names, regions, frames, inject = (_words(parameters[name]) for name in LISTS)
@@ -45,7 +45,7 @@ def _selection(parameters):
     """Return the selection of visibilities, None where there are none."""
     if _words(parameters["vis"]):
         return selection_of(parameters)
-    defaults = {parameter.name: parameter.default for parameter in PARAMETERS}
+    defaults = {parameter.name: parameter.default for parameter in SARACOMPARE}
     for name in OF_VIS:
         if parameters[name] != defaults[name]:
             raise ValueError(f"{name} = {parameters[name]!r} has no effect without vis: give vis, or leave {name} at "

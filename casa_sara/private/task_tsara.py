@@ -9,27 +9,32 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import casa_sara
 from casa_sara.analysis import folder
-from casa_sara.casa import log
-from casa_sara.casa.blockwords import parsed
-from casa_sara.casa.lock import one_run_of
-from casa_sara.casa.modelcolumn import check_model_column_writable, incomplete_columns
-from casa_sara.casa.products import (
-    CHECKPOINT, REPORT, check_imagename, existing_products, history_lines, recover_products,
+from casa_sara.casa.images.products import (
+    CHECKPOINT,
+    REPORT,
+    check_imagename,
+    existing_products,
+    history_lines,
+    recover_products,
 )
-from casa_sara.casa.quantities import hertz, radians, seconds
-from casa_sara.casa.restore import restoring_beam_words
-from casa_sara.casa.spectralaxis import channel_number
-from casa_sara.casa.spectrum import check_spectral_index
-from casa_sara.cube import make_cube
-from casa_sara.imaging import make_image
+from casa_sara.casa.images.restore import restoring_beam_words
+from casa_sara.casa.images.spectral_axis import channel_number
+from casa_sara.casa.images.spectral_index import check_spectral_index
+from casa_sara.casa.ms.block_selection import parsed
+from casa_sara.casa.ms.model_column import check_model_column_writable, incomplete_columns
+from casa_sara.casa.runtime import log
+from casa_sara.casa.runtime.lock import one_run_of
+from casa_sara.casa.runtime.quantities import hertz, radians, seconds
+from casa_sara.imaging.continuum import make_image
+from casa_sara.imaging.cube import make_cube
+from casa_sara.imaging.dry_run import dry_run
 from casa_sara.options import Comparing, ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
-from casa_sara.parallel import SERIAL
+from casa_sara.parallel.serial import SERIAL
 from casa_sara.private.launch import in_parallel
 from casa_sara.private.summary import cube_summary, summary
-from casa_sara.rehearsal import rehearse
-from casa_sara.resources import available_cores
+from casa_sara.runtime.machine import available_cores
+from casa_sara.version import __version__
 
 __all__ = ["selection_of", "tsara"]
 
@@ -44,7 +49,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
 
 def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     """Run the task on the ranks of a communicator, of which rank 0 alone writes; return the same on all."""
-    log.info(f"casa_sara {casa_sara.__version__}")
+    log.info(f"casa_sara {__version__}")
     _check_stokes(parameters)
     if parameters["method"] == "dabbech2018":
         log.info("method = 'dabbech2018': Algorithms 1 and 2 exactly as in Dabbech et al. (2018)")
@@ -59,7 +64,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
         raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is in "
                          "the first lines of the log of a normal run, and docs/parallel.md explains its time")
     if parameters["dryrun"]:
-        return {"forecast": rehearse(selection, grid, options, _blocks(parameters), limits)}
+        return {"forecast": dry_run(selection, grid, options, _blocks(parameters), limits)}
     make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
@@ -69,7 +74,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
             comm.once(_report, output.imagename, selection, options.nthreads)
         elif not output.images_stand:
             comm.once(folder.remove, Path(output.imagename + REPORT))  # of older images
-    return comm.broadcast(tell(result, options, parameters["fullsummary"]))
+    return comm.bcast(tell(result, options, parameters["fullsummary"]))
 
 
 def _prepare(parameters, selection, grid, stack):
@@ -96,7 +101,7 @@ def _warn_of_incomplete(vis, output):
 def _report(imagename, selection, nthreads):
     """Write the report of one run."""
     from casa_sara.analysis.report import write_report
-    from casa_sara.compare import compare_images
+    from casa_sara.comparison.compare_images import compare_images
 
     log.info("writing the report")
     comparison = compare_images(Comparing((imagename,), nthreads=nthreads), selection, single=True)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from casa_sara import jit
+from casa_sara.runtime import jit
 
 _jit = jit.kernel(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from casa_sara.parallel import SERIAL, Serial
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.solver import _kernels as kernels
 from casa_sara.solver.interfaces import Measurement, Prior
 from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.prox import ellipsoid_multiplier
-from casa_sara.solver.statefile import fill
 
 __all__ = ["BASIS_ARRAYS", "SAMPLE_ARRAYS", "AdaptivePPD"]
 
@@ -80,7 +79,7 @@ class AdaptivePPD:
         x ≥ 0, or only real.
     relaxation : float
         ρ.
-    comm : casa_sara.parallel.Serial or MPI
+    comm : casa_sara.parallel.serial.Serial or MPI
         Where ranks share the work, each has its own samples of every block, its own bases, and the same images: a step
         needs one sum of the image's gradient over them, and of the d squared residual norms.
 
@@ -134,23 +133,23 @@ class AdaptivePPD:
         self.points = PointSources()
         self.tau, self.l2_step = STEP, 1.0 / data_norm_sq
         dtype = vis.real.dtype
-        self.model, self.anchor, self.model_bar, self.lowest = comm.images(4, measurement.shape, dtype)
+        self.model, self.anchor, self.model_bar, self.lowest = comm.shared_images(4, measurement.shape, dtype)
         self.lowest[...] = 0 if positivity else -np.inf
-        self._data_gradient, self._slots = np.zeros(measurement.shape, dtype), comm.slots(measurement.shape, dtype)
+        self._data_gradient, self._slots = np.zeros(measurement.shape, dtype), comm.shared_slots(measurement.shape, dtype)
         self._prior_gradient = self._slots[comm.rank] if self._slots else np.zeros(measurement.shape, dtype)
         self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
         self.l1_dual, self.l1_weights = dictionary.allocate(), dictionary.allocate()
         self.l1_weights[...] = 1
         self.threshold = 0.0
         self.multipliers, self.l2_bounds, self.constrained = np.zeros(self.n_blocks), np.zeros(self.n_blocks), False
-        self.begins, self.block_sizes = comm.place(np.diff(self.offsets))
+        self.begins, self.block_sizes = comm.exscan(np.diff(self.offsets))
         self.residual_norms = comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()]))
         self._pieces = np.array([(a, min(a + PIECE, stop), j) for j, (start, stop) in enumerate(self.blocks())
                                  for a in range(start, stop, PIECE)], dtype=int).reshape(-1, 3)
         self._piece_norms_sq, self._norms_sq = np.zeros(len(self._pieces)), np.zeros(self.n_blocks)
         self.rel_change = np.inf
         self.model_flux = self.model_max = 0.0
-        self._sums, = comm.images(1, (measurement.shape[0], 4), float)
+        self._sums, = comm.shared_images(1, (measurement.shape[0], 4), float)
         self.iteration = 0
         self.unit_jy = 1.0
 
@@ -182,7 +181,7 @@ class AdaptivePPD:
         """
         self.confined_to = support
         self.lowest[~support] = np.inf
-        self.comm.settle()
+        self.comm.barrier()
 
     def support_only(self, support: np.ndarray, points: PointSources = PointSources()) -> None:
         """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again.
@@ -197,13 +196,13 @@ class AdaptivePPD:
         if self.confined_to is not None:
             support = support & self.confined_to
         free = 0 if self.positivity else -np.inf
-        self.comm.settle()  # all ranks of one machine have read, and write the same
+        self.comm.barrier()  # all ranks of one machine have read, and write the same
         self.lowest[self.points.x, self.points.y] = free
         self.lowest[support & (self.lowest == np.inf)] = free
         self.lowest[~support] = np.inf
         self.lowest[points.x, points.y] = -np.inf
         self.points = points
-        self.comm.settle()
+        self.comm.barrier()
 
     def start_from(self, model: np.ndarray) -> None:
         """Set x, z and x̄ to `model`, 0 outside the support; the dual variables stay.
@@ -216,7 +215,7 @@ class AdaptivePPD:
         for image in (self.model, self.anchor, self.model_bar):
             image[...] = model  # ranks of one machine write the same
             image[self.lowest == np.inf] = 0
-        self.comm.settle()
+        self.comm.barrier()
         self.measurement.forward(self.model, self._phi_anchor)
 
     def constrain(self, l2_bounds: np.ndarray) -> None:
@@ -257,7 +256,7 @@ class AdaptivePPD:
         self.measurement.workers.run(kernels.data_step, *pairs, self.precond, self._pieces, self.multipliers,
                                      self.precond.dtype.type(self.relaxation), self._piece_norms_sq)
         self._norms_sq[:] = np.bincount(self._pieces[:, 2], self._piece_norms_sq, self.n_blocks)
-        summed_norms_sq = self.comm.start_sum(self._norms_sq)
+        summed_norms_sq = self.comm.iallreduce(self._norms_sq)
         self.measurement.adjoint(self.l2_dual, self._data_gradient)
         return summed_norms_sq
 
@@ -280,15 +279,15 @@ class AdaptivePPD:
         gradients, steps = self._summed_gradients((real(self.tau), real(self.l2_step), real(self.relaxation)))
         self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, *gradients, steps,
                                      self.lowest, self._sums, part=self.comm.part)
-        self.comm.settle()
+        self.comm.barrier()
         sums, greatest = self._sums[:, :3].sum(axis=0), self._sums[:, 3].max()
         if len(self.points):
             if self.comm.part[0] == 0:
                 sums += self.points.project(self.model, self.anchor, self.model_bar, points_before)
-            self.comm.settle()
+            self.comm.barrier()
             sums, greatest = np.maximum(sums, (0, 0, -np.inf)), self.model.max()
         sums = [*sums.tolist(), float(greatest)]
-        change, norm, self.model_flux, self.model_max = self.comm.lead(sums)
+        change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
 
     def _summed_gradients(self, steps):
@@ -303,9 +302,9 @@ class AdaptivePPD:
         if self.vis.size:
             run(kernels.add_scaled, *gradients, steps[1])
         if not self._slots:
-            gradient = self.comm.sum(self._prior_gradient)
+            gradient = self.comm.allreduce(self._prior_gradient)
             return (gradient, gradient), (steps[0], real(0), steps[2])
-        self.comm.settle()
+        self.comm.barrier()
         first, *between, last = self._slots
         for other in between:
             run(kernels.add_scaled, other, first, real(1), part=self.comm.part)
@@ -325,7 +324,7 @@ class AdaptivePPD:
         -------
         real (nx, ny)
         """
-        return self.comm.sum(self.measurement.adjoint(vis, out))
+        return self.comm.allreduce(self.measurement.adjoint(vis, out))
 
     def rescale(self, threshold: float) -> None:
         """Change κ and, with it, the dual variables and multipliers: the same problem, other step sizes.
@@ -357,10 +356,20 @@ class AdaptivePPD:
         return arrays | values | dict(l2_bounds=self.l2_bounds, points=self.points.places)
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Take over what :meth:`state` has returned, by copies."""
+        """Take over what :meth:`state` has returned, by copies.
+
+        Raises
+        ------
+        ValueError
+            An array has another shape or type than this iteration's.
+        """
         for name in STATE_ARRAYS:
-            fill(getattr(self, name), state[name])
-        self.comm.settle()
+            array, values = getattr(self, name), state[name]
+            if np.shape(values) != array.shape or values.dtype != array.dtype:
+                raise ValueError(f"{name}: an array of shape {array.shape} and type {array.dtype} is wanted, not "
+                                 f"{np.shape(values)}")
+            array[...] = values
+        self.comm.barrier()
         for name in STATE_VALUES:
             setattr(self, name, state[name])
         self.l2_bounds = np.array(state["l2_bounds"])

@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from casa_sara import jit
-
+from casa_sara.runtime import jit
 from casa_sara.solver.interfaces import Dictionary
 
 __all__ = ["PaperPrior"]

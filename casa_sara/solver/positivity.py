@@ -63,9 +63,9 @@ class Release:
             return 0
         around = binary_dilation(again, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
         count = np.count_nonzero(ppd.lowest)
-        ppd.comm.settle()  # all ranks of one machine have counted, and write the same
+        ppd.comm.barrier()  # all ranks of one machine have counted, and write the same
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around & (ppd.lowest < np.inf))
-        ppd.comm.settle()
+        ppd.comm.barrier()
         return int(np.count_nonzero(ppd.lowest) - count)
 
     def state(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from casa_sara.parallel import SERIAL, Serial
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.solver import _kernels as kernels
 
 __all__ = ["ellipsoid_multiplier", "project_ellipsoid"]
@@ -34,7 +34,7 @@ def ellipsoid_multiplier(dual: np.ndarray, phi_bar: np.ndarray, vis: np.ndarray,
         First guess, e.g. that of the iteration before.
     start, stop : int
         The block is samples start … stop − 1.
-    comm : casa_sara.parallel.Serial or MPI
+    comm : casa_sara.parallel.serial.Serial or MPI
         Whose ranks hold the samples of the block.
 
     Returns
@@ -66,7 +66,7 @@ def ellipsoid_multiplier(dual: np.ndarray, phi_bar: np.ndarray, vis: np.ndarray,
 def _norms(comm, *arguments):
     """n² and −½ d(n²)/dλ of the samples of all ranks."""
     norms = kernels.shifted_norms(*arguments)
-    return norms if comm.size == 1 else comm.sum(np.array(norms)).tolist()
+    return norms if comm.size == 1 else comm.allreduce(np.array(norms)).tolist()
 
 
 def project_ellipsoid(point: np.ndarray, centre: np.ndarray, precond: np.ndarray, bound: float) -> np.ndarray:

@@ -13,8 +13,15 @@ from casa_sara.solver.islands import look_at
 from casa_sara.solver.l1_weights import first_weights, reweight
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.positivity import Release
-from casa_sara.solver.record import (CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, STRUCTURED, UNFEASIBLE,
-                                     SolverRecord)
+from casa_sara.solver.record import (
+    CONVERGED,
+    DIVERGED,
+    ITERATION_LIMIT,
+    STOPPED_BY_USER,
+    STRUCTURED,
+    UNFEASIBLE,
+    SolverRecord,
+)
 from casa_sara.solver.significance import SignificantSupport
 
 __all__ = ["Schedule", "Stage", "solve"]
@@ -224,7 +231,7 @@ def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
 
 def _renew_weights(ppd, bounds, schedule, stage):
     """Re-weight by the present solution; return False, with nothing done, when one more would change nothing."""
-    change = ppd.comm.lead([_relative(ppd.model, stage.previous)])[0]
+    change = ppd.comm.bcast_numbers([_relative(ppd.model, stage.previous)])[0]
     scale = FIRST_SCALE * schedule.reweight_decay**stage.k
     released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
     if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, change):

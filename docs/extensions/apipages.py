@@ -1,6 +1,6 @@
 """API pages: behind the text of a page api/NAME, every public module of the package casa_sara.NAME, by autodoc.
 
-The page api/library has the modules that stand beside the packages. Modules that begin with an underscore are left out.
+The page api/options has the modules that stand beside the packages. Modules that begin with an underscore are left out.
 """
 
 from __future__ import annotations
@@ -9,15 +9,15 @@ import re
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[2] / "casa_sara"
-BESIDE = "library"
+BESIDE = "options"
 SEVERAL = re.compile(r"\w+(, \w+)+(?= :|$)")  # attributes in one line
 
 
 def modules(page: str) -> list[str]:
     """Return the names of the modules of an API page."""
-    folder = PACKAGE if page == BESIDE else PACKAGE / page
-    prefix = "casa_sara." if page == BESIDE else f"casa_sara.{page}."
-    return [prefix + path.stem for path in sorted(folder.glob("*.py")) if not path.stem.startswith("_")]
+    paths = PACKAGE.glob("*.py") if page == BESIDE else (PACKAGE / page).rglob("*.py")
+    names = (".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in paths if not path.stem.startswith("_"))
+    return sorted(names)
 
 
 def api_page(page: str) -> str:

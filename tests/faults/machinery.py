@@ -83,10 +83,10 @@ def dies_in(module, name, call=1, after=False):
 
 
 def begun_with(script):
-    """Return the program of the child process of `casa_sara.casa.child`, with a script of Python before its job."""
-    from casa_sara.casa import child
+    """Return the program of the child process of `casa_sara.casa.runtime.child_process`, with a script of Python before its job."""
+    from casa_sara.casa.runtime import child_process
 
-    first, main = child._START.rsplit("; ", 1)
+    first, main = child_process._START.rsplit("; ", 1)
     return f"{first}\n{PREAMBLE}{script}\n{main}"
 
 

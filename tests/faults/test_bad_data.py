@@ -17,7 +17,7 @@ from simulated_ms import CYGNUS_A, column, edit, pixels  # noqa: E402
 from spoiled import BROKEN, FAULTS, GRID, HOPELESS, ROW, SAMPLE, flag, observe, put  # noqa: E402
 
 from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.usable import IN_FLAGS  # noqa: E402
+from casa_sara.casa.ms.usable_samples import IN_FLAGS  # noqa: E402
 
 SAME = 1e-5  # of the brightest pixel
 LONGEST_S = 120  # of all broken MeasurementSets together, which take some seconds

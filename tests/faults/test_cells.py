@@ -11,9 +11,9 @@ from simulated_ms import _tool, add_column, column, pixels  # noqa: E402
 from spoiled import GRID, ROW, cells, observe, remake, shaped, undefined  # noqa: E402
 
 from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.ms import read_visibilities  # noqa: E402
-from casa_sara.casa.selection import select_data  # noqa: E402
-from casa_sara.casa.weights import sampling_density  # noqa: E402
+from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
+from casa_sara.casa.ms.selection import select_data  # noqa: E402
+from casa_sara.casa.ms.weights import sampling_density  # noqa: E402
 from casa_sara.options import ImageGrid, Selection  # noqa: E402
 
 WINDOWS = (("8.4GHz", "2MHz", 3), ("8.6GHz", "1MHz", 5))

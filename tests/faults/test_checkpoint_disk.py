@@ -7,8 +7,8 @@ from simulated_ms import simulate
 casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara
-from casa_sara.casa import log
-from casa_sara.solver import checkpoint
+from casa_sara.casa.runtime import log
+from casa_sara.reconstruction import checkpoint
 from casa_sara.solver.record import ITERATION_LIMIT
 
 GRID = dict(imsize=64, cell="1arcsec", datacolumn="data", nthreads=1)

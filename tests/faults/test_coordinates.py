@@ -17,7 +17,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from simulated_ms import SPEED_OF_LIGHT, antenna_positions, column, edit, pixels, simulate  # noqa: E402
 
 from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.casa import frames, imageplane  # noqa: E402
+from casa_sara.casa.images import image_plane  # noqa: E402
+from casa_sara.casa.ms import frames  # noqa: E402
 
 ARCSEC = np.radians(1 / 3600)
 L, M = -5 * ARCSEC, 7 * ARCSEC  # of the 1 Jy source
@@ -102,7 +103,7 @@ def test_a_cube_and_a_comparison_at_the_pole():
 def test_coordinates_that_are_not_those_of_the_pixels_are_refused(monkeypatch, mistaken):
     """Whatever it is that CASA does otherwise than is foreseen here: mirrored, turned, exchanged axes."""
     vis = simulate("x.ms", antennas=6, scans=1, noise=0.1)
-    monkeypatch.setattr(imageplane, "image_basis", lambda direction: mistaken @ frames.image_basis(direction))
+    monkeypatch.setattr(image_plane, "image_basis", lambda direction: mistaken @ frames.image_basis(direction))
     for mode in ("mfs", "cube"):
         with pytest.raises(ValueError, match="phasecenter = '', projection = 'SIN': CASA's coordinates of this image differ"):
             tsara(vis=vis, imagename="t", niter=0, specmode=mode, **GRID)
@@ -116,12 +117,12 @@ def test_the_check_holds_for_all_sizes_of_pixels(cell, centre):
     """Of microarcseconds, and of images from horizon to horizon: no right one is refused."""
     from dataclasses import replace
 
-    from casa_sara.casa.ms import read_visibilities
+    from casa_sara.casa.ms.read import read_visibilities
     from casa_sara.options import ImageGrid, Selection
 
     selection = Selection((simulate("x.ms", antennas=6, scans=1, noise=0.1),), datacolumn="data")
     data = replace(read_visibilities(selection), phase_center=frames.direction_measure(*centre))
-    imageplane.define_image_plane(data, selection, ImageGrid((1024, 512), (cell, 2 * cell)))
+    image_plane.define_image_plane(data, selection, ImageGrid((1024, 512), (cell, 2 * cell)))
 
 
 # Frames that turn with the Earth -----------------------------------------------------------------

@@ -11,7 +11,7 @@ from simulated_ms import column, edit, pixels  # noqa: E402
 from spoiled import GRID, observe  # noqa: E402
 
 from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.casa.ms import read_visibilities  # noqa: E402
+from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
 from casa_sara.options import Selection  # noqa: E402
 
 CODES = {name: code for code, name in enumerate("I Q U V RR RL LR LL XX XY YX YY".split(), 1)}

@@ -11,8 +11,8 @@ from simulated_ms import add_column, column, edit, pixels  # noqa: E402
 from spoiled import GRID, observe  # noqa: E402
 
 from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.ms import read_visibilities  # noqa: E402
-from casa_sara.casa.weights import sampling_density  # noqa: E402
+from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
+from casa_sara.casa.ms.weights import sampling_density  # noqa: E402
 from casa_sara.options import ImageGrid, Selection  # noqa: E402
 
 ROWS, ALL, THIRD = 336, np.s_[:], np.s_[::3]

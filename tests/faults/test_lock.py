@@ -13,12 +13,12 @@ from simulated_ms import simulate
 pytest.importorskip("casatools")
 
 from casa_sara import tsara
-from casa_sara.casa import lock
-from casa_sara.casa.lock import one_run_of
+from casa_sara.casa.runtime import lock
+from casa_sara.casa.runtime.lock import one_run_of
 
 HOLDS = """
 import sys
-from casa_sara.casa.lock import one_run_of
+from casa_sara.casa.runtime.lock import one_run_of
 with one_run_of(sys.argv[1]):
     print("held", flush=True)
     sys.stdin.read()
@@ -144,7 +144,7 @@ def test_tsara_takes_the_lock_before_it_reads_and_gives_it_back(name, tmp_path):
     with one_run_of(name), pytest.raises(BlockingIOError, match="is writing under this name"):
         tsara(**grid | {"field": "NOWHERE"})
     killed(f"""
-import casa_sara.imaging as imaging
+import casa_sara.imaging.continuum as imaging
 dies_in(imaging, "read_visibilities")
 tsara(**{grid!r})
 """)

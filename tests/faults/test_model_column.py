@@ -14,9 +14,10 @@ from spoiled import shaped, undefined
 casatools = pytest.importorskip("casatools")
 
 from casa_sara import tsara
-from casa_sara.casa import child, modelcolumn
-from casa_sara.casa.child import in_child
-from casa_sara.casa.modelcolumn import INCOMPLETE, incomplete_columns
+from casa_sara.casa.ms import model_column
+from casa_sara.casa.ms.model_column import INCOMPLETE, incomplete_columns
+from casa_sara.casa.runtime import child_process
+from casa_sara.casa.runtime.child_process import in_child
 
 GRID = dict(imsize=64, cell="1arcsec", datacolumn="data", niter=3, nthreads=1)
 FINISH = GRID | dict(restart=True, niter=0, savemodel="modelcolumn")
@@ -55,15 +56,15 @@ def products_of(folder):
 
 FAMILY_DIES = """
 import time
-import casa_sara.casa.modelcolumn as modelcolumn
+import casa_sara.casa.ms.model_column as model_column
 def die():
     os.kill(os.getppid(), signal.SIGKILL)
     {last}
-modelcolumn._CHUNK = 300
+model_column._CHUNK = 300
 """
 KILLED = """
-import casa_sara.casa.child as child
-child._START = {start!r}
+import casa_sara.casa.runtime.child_process as child_process
+child_process._START = {start!r}
 tsara(vis={vis!r}, imagename={name!r}, savemodel="modelcolumn", **{grid!r})
 """
 
@@ -75,8 +76,8 @@ def kill_in_child(copy, name, where, last="os.kill(os.getpid(), signal.SIGKILL)"
 
 
 @pytest.mark.parametrize("where, most_written", [
-    ('dies_in(modelcolumn, "_mark", after=True)', None),
-    ('dies_in(modelcolumn, "_at_field_centre", 6)', 0.7),
+    ('dies_in(model_column, "_mark", after=True)', None),
+    ('dies_in(model_column, "_at_field_centre", 6)', 0.7),
 ], ids=["before it is added", "in the middle"])
 def test_kill_9_while_the_column_is_written(vis, uninterrupted, copy, tmp_path, where, most_written):
     """The images are whole, the rest of the MeasurementSet is as it was, and niter = 0 finishes the column."""
@@ -126,7 +127,7 @@ def test_the_child_ends_with_its_parent(copy, tmp_path):
     """kill -9 of the session alone: nothing goes on writing behind its back."""
     pid = tmp_path / "pid"
     last = f"open({str(pid)!r}, 'w').write(str(os.getpid())); time.sleep(120)"
-    kill_in_child(copy, tmp_path / "source", 'dies_in(modelcolumn, "_at_field_centre", 6)', last)
+    kill_in_child(copy, tmp_path / "source", 'dies_in(model_column, "_at_field_centre", 6)', last)
     for _ in range(300):
         if pid.exists() and pid.read_text() and not os.path.exists(f"/proc/{pid.read_text()}"):
             break
@@ -150,7 +151,7 @@ def test_a_disk_that_fills_while_the_column_is_added(vis, uninterrupted, tmp_pat
             fill(disk, left)
             in_child(*args, **kwargs)
 
-        monkeypatch.setattr(modelcolumn, "in_child", filled)
+        monkeypatch.setattr(model_column, "in_child", filled)
         with pytest.raises(OSError, match="savemodel = 'modelcolumn': MODEL_DATA could not be written, the disk is "
                                           "full: .*; the MeasurementSets are as they were"):
             tsara(vis=str(copy), imagename=str(tmp_path / "source"), **FINISH)
@@ -174,7 +175,7 @@ def test_a_disk_that_is_full_when_the_column_is_due(vis, uninterrupted, tmp_path
             tsara(vis=str(copy), imagename=str(tmp_path / "never"), savemodel="modelcolumn", **GRID)
         assert raised.value.errno == errno.ENOSPC and not (tmp_path / "never.model").exists()
         filler.unlink()
-        monkeypatch.setattr("casa_sara.imaging.fit_beam", fit_beam_and(lambda: fill(disk, 200_000)))
+        monkeypatch.setattr("casa_sara.imaging.continuum.fit_beam", fit_beam_and(lambda: fill(disk, 200_000)))
         with pytest.raises(OSError, match=words):
             tsara(vis=str(copy), imagename=str(tmp_path / "source"), savemodel="modelcolumn", **GRID)
         assert (tmp_path / "source.sara.json").exists() and hashes(copy, "table.lock") == before
@@ -191,14 +192,14 @@ def test_a_disk_that_fills_after_the_column_was_added(vis, uninterrupted, tmp_pa
         shutil.copytree(f"{images}.{kind}", tmp_path / f"source.{kind}")
     with small_disk(tmp_path / "disk", 3_000) as disk:
         copy = shutil.copytree(vis, disk / "c.ms")
-        monkeypatch.setattr(child, "_START", begun_with(f"""
-import casa_sara.casa.modelcolumn as modelcolumn
-original = modelcolumn._write
+        monkeypatch.setattr(child_process, "_START", begun_with(f"""
+import casa_sara.casa.ms.model_column as model_column
+original = model_column._write
 def filled(*args):
     state = os.statvfs({str(disk)!r})
     open({str(disk / 'filler')!r}, "wb", buffering=0).write(bytes(state.f_bavail * state.f_frsize))
     return original(*args)
-modelcolumn._write = filled
+model_column._write = filled
 """))
         words = f"the disk is full: .*; MODEL_DATA of {copy} is incomplete; restart=True"
         with pytest.raises(OSError, match=words) as got:
@@ -238,7 +239,7 @@ def test_a_column_that_cannot_be_written_is_refused_first(uninterrupted, copy, t
 
 
 def fit_beam_and(also):
-    from casa_sara.casa.restore import fit_beam
+    from casa_sara.casa.images.restore import fit_beam
 
     def fitted(*args):
         also()

@@ -16,8 +16,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from simulated_ms import simulate  # noqa: E402
 
 from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.casa.skyimage import read_sky_image  # noqa: E402
-from casa_sara.compare import compare_images  # noqa: E402
+from casa_sara.casa.images.sky_image import read_sky_image  # noqa: E402
+from casa_sara.comparison.compare_images import compare_images  # noqa: E402
 from casa_sara.options import Comparing  # noqa: E402
 
 ARCSEC = np.radians(1 / 3600)

@@ -10,16 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 casatools = pytest.importorskip("casatools")
 
 from simulated_ms import simulate  # noqa: E402
 
 from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.tasks.saracompare import PARAMETERS as OF_SARACOMPARE  # noqa: E402
-from casa_sara.tasks.tsara import PARAMETERS as OF_TSARA  # noqa: E402
+from casa_sara.private.parameters import SARACOMPARE, TSARA  # noqa: E402
 
 REFUSALS = (ValueError, TypeError, OSError, MemoryError)  # OSError: a path that is not there, or not to be written
 EXAMPLES, OF_SLOW = 6, 2
@@ -110,11 +108,11 @@ def models(vis):
 SMALL = dict(imsize=16, cell="3arcsec", datacolumn="data", wavelets=["dirac"], nthreads=1)
 
 
-@pytest.mark.parametrize("parameter", OF_TSARA, ids=lambda parameter: parameter.name)
+@pytest.mark.parametrize("parameter", TSARA, ids=lambda parameter: parameter.name)
 def test_tsara_names_the_parameter_that_it_refuses(vis, tmp_path, parameter):
     before = contents(vis)
     own = shutil.copytree(vis, tmp_path / "own.ms") if parameter.name == "savemodel" else vis
-    call = dict(vis=str(own), imagename="out", niter=2, overwrite=True, **SMALL) | opened(OF_TSARA, parameter.name)
+    call = dict(vis=str(own), imagename="out", niter=2, overwrite=True, **SMALL) | opened(TSARA, parameter.name)
     if call.get("databound") == "fixed":
         call["l2bound"] = 1.0
 
@@ -127,10 +125,10 @@ def test_tsara_names_the_parameter_that_it_refuses(vis, tmp_path, parameter):
     assert contents(vis) == before
 
 
-@pytest.mark.parametrize("parameter", OF_SARACOMPARE, ids=lambda parameter: parameter.name)
+@pytest.mark.parametrize("parameter", SARACOMPARE, ids=lambda parameter: parameter.name)
 def test_saracompare_names_the_parameter_that_it_refuses(vis, models, parameter):
     before = contents(vis)
-    call = dict(models=models, vis=vis, datacolumn="data") | opened(OF_SARACOMPARE, parameter.name)
+    call = dict(models=models, vis=vis, datacolumn="data") | opened(SARACOMPARE, parameter.name)
 
     @bounded(parameter)
     @given(values_of(parameter))

@@ -15,9 +15,16 @@ from simulated_ms import pixels, simulate
 pytest.importorskip("casatools")
 
 from casa_sara import tsara
-from casa_sara.casa import products
-from casa_sara.casa.child import ChildError, in_child
-from casa_sara.casa.products import PRODUCTS, RECORD, existing_products, new_products, recover_products, write_products
+from casa_sara.casa.images import products
+from casa_sara.casa.images.products import (
+    PRODUCTS,
+    RECORD,
+    existing_products,
+    new_products,
+    recover_products,
+    write_products,
+)
+from casa_sara.casa.runtime.child_process import ChildError, in_child
 
 GRID = dict(imsize=64, cell="1arcsec", datacolumn="data")
 ALL = [*PRODUCTS, RECORD]
@@ -38,7 +45,7 @@ def run(vis, tmp_path_factory):
         products.write_products(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("casa_sara.imaging.write_products", noted)
+        patch.setattr("casa_sara.imaging.continuum.write_products", noted)
         tsara(vis=vis, imagename=str(name), niter=2, **GRID)
     return name.parent, called[0]
 
@@ -101,7 +108,7 @@ def test_a_disk_without_room_is_refused_before_and_after_the_solution(vis, tmp_p
         with pytest.raises(OSError, match=r"imagename = '.*', imsize = .*: the images take 2.1 MB, '.*' has 1.0 MB left"):
             tsara(vis=vis, imagename=str(disk / "source"), niter=0, **GRID)
         filler.unlink()
-        monkeypatch.setattr("casa_sara.imaging.fit_beam", lambda *args: fill(disk, 1_000_000) and {})
+        monkeypatch.setattr("casa_sara.imaging.continuum.fit_beam", lambda *args: fill(disk, 1_000_000) and {})
         with pytest.raises(OSError, match=r"imagename = '.*', imsize = .*: the images take 2.1 MB, '.*' has 1.0 MB left"):
             tsara(vis=vis, imagename=str(disk / "source"), niter=0, **GRID)
         assert [path.name for path in disk.iterdir()] == ["filler"]
@@ -119,16 +126,16 @@ def test_temporary_files_without_room(vis, tmp_path, monkeypatch):
 
 def test_a_failure_of_casa_is_told_in_its_words(tmp_path):
     with pytest.raises(ChildError, match="missing 5 required positional arguments: 'csys'"):
-        in_child("products", root=str(tmp_path / "x"), plane={}, images={}, sumwt=1.0, beam={}, restoringbeam=None,
+        in_child(products.write_images, root=str(tmp_path / "x"), plane={}, images={}, sumwt=1.0, beam={}, restoringbeam=None,
                  history=[])
-    with pytest.raises(ChildError, match="KeyError: 'absent'"):
-        in_child("absent")
+    with pytest.raises(ChildError, match="posixpath:join is no function of casa_sara"):
+        in_child(os.path.join)
 
 
 STEPS = 1 + len(ALL) + 1 + 3  # to .whole, older ones away, to .moving, new ones to their places
 KILLED_AT_EVERY_STEP = """
 import sys
-from casa_sara.casa.products import new_products
+from casa_sara.casa.images.products import new_products
 for step in range(int(sys.argv[2]) + 1):
     child = os.fork()
     if child:
@@ -172,7 +179,7 @@ def test_kill_9_while_products_are_written(vis, old, tmp_path, after):
     (tmp_path / ".source.new.new").mkdir()  # of a run called source.new
     before = hashes(tmp_path)
     killed(f"""
-import casa_sara.casa.products as products
+import casa_sara.casa.images.products as products
 dies_in(products, "in_child", after={after})
 tsara(vis={vis!r}, imagename={str(tmp_path / 'source')!r}, niter=0, overwrite=True, **{GRID!r})
 """)

@@ -11,9 +11,10 @@ import pytest
 casatools = pytest.importorskip("casatools")
 
 import casa_sara  # noqa: E402
-from casa_sara import jsonfile, saracompare  # noqa: E402
+from casa_sara import saracompare  # noqa: E402
 from casa_sara.analysis.convergence import block_noise, convergence  # noqa: E402
-from casa_sara.casa.record import read_record  # noqa: E402
+from casa_sara.casa.images.record import read_record  # noqa: E402
+from casa_sara.runtime import jsonfile  # noqa: E402
 
 PACKAGE = Path(casa_sara.__file__).parent
 MODULES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))
@@ -24,9 +25,9 @@ CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "os.e
 IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve", "joblib", "cloudpickle", "subprocess", "pty", "ctypes.util",
            "runpy", "code", "xmlrpc", "telnetlib"}
 EXCEPTIONS = {
-    ("mpi.py", "pickle"): "an error of its own is packed and unpacked, to see whether mpi4py can send it",
-    ("casa/child.py", "subprocess"): "this Python, told its job by JSON and names out of a list of its own",
-    ("warmup.py", "subprocess"): "this Python, with a fixed text that compiles the kernels of the dictionary",
+    ("parallel/mpi.py", "pickle"): "an error of its own is packed and unpacked, to see whether mpi4py can send it",
+    ("casa/runtime/child_process.py", "subprocess"): "this Python, told a function of casa_sara and its arguments by JSON",
+    ("reconstruction/compile_cache.py", "subprocess"): "this Python, with a fixed text that compiles the kernels of the dictionary",
     ("private/shelltask.py", "runpy"): "tget runs what tput saved, as CASA's own tasks do",
     ("private/shelltask.py", "runpy.run_path"): "tget runs what tput saved, as CASA's own tasks do",
 }

@@ -19,8 +19,8 @@ from test_bad_data import assert_refused, contents  # noqa: E402
 
 from casa_sara import saracompare, tsara  # noqa: E402
 from casa_sara.analysis.folder import PAGE  # noqa: E402
-from casa_sara.casa.skyimage import read_sky_image  # noqa: E402
-from casa_sara.casa.subtables import readable  # noqa: E402
+from casa_sara.casa.images.sky_image import read_sky_image  # noqa: E402
+from casa_sara.casa.ms.subtables import readable  # noqa: E402
 
 NAME = "J\u00fcrgen"
 LONGEST_S = 200  # of all cases together, which take half a minute

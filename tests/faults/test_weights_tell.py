@@ -12,10 +12,10 @@ from simulated_ms import column, edit, pixels  # noqa: E402
 from spoiled import ARCSEC, observe  # noqa: E402
 
 from casa_sara import tsara  # noqa: E402
-from casa_sara.casa import ms as reader  # noqa: E402
-from casa_sara.casa.usable import Usability  # noqa: E402
+from casa_sara.casa.ms import read as reader  # noqa: E402
+from casa_sara.casa.ms.usable_samples import Usability  # noqa: E402
 from casa_sara.options import Selection  # noqa: E402
-from casa_sara.parallel import Serial  # noqa: E402
+from casa_sara.parallel.serial import Serial  # noqa: E402
 
 HEAVY_ROW, STRONG_ROW = 7, 19  # among the good rows
 

@@ -1,0 +1,222 @@
+"""What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
+(.mask .image.pbcor .model.pbcor), and the record .sara.json.
+
+They appear together. They are written in `.<name>.new`, beside their places; when all are complete and on the disk, the
+folder is renamed `.<name>.whole`, and from then on they are the products: the older ones go to `.<name>.old`, the
+folder becomes `.<name>.moving`, its contents go to their places, and `.<name>.old` is removed. A run that is killed
+leaves one of these folders, and the next one under this name goes by it: `.new` is thrown away, `.whole` and `.moving`
+are followed to the end. No name of another run can give one of these folders.
+"""
+
+from __future__ import annotations
+
+import errno
+import math
+import os
+import shutil
+from contextlib import contextmanager
+
+import numpy as np
+
+from casa_sara.casa.images.image_files import write_image
+from casa_sara.casa.images.image_plane import ImagePlane
+from casa_sara.casa.images.restore import restore, write_corrected
+from casa_sara.casa.runtime.child_process import ChildError, in_child
+from casa_sara.casa.runtime.tools import opened
+from casa_sara.runtime import jsonfile
+from casa_sara.runtime.signals import signals_deferred
+from casa_sara.version import __version__
+
+__all__ = [
+    "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
+    "recover_products",
+    "remove_products", "write_products",
+]
+
+PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
+ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor")
+CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
+RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
+
+
+def existing_products(imagename):
+    """Return the paths of the existing products of this name."""
+    return [imagename + suffix for suffix in (*PRODUCTS, *ON_REQUEST, RECORD, REPORT)
+            if os.path.lexists(imagename + suffix)]
+
+
+def remove_products(imagename):
+    """Remove the existing products of this name."""
+    for path in existing_products(imagename):
+        shutil.rmtree(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
+
+
+def check_imagename(imagename, shape, more=0):
+    """Raise unless the products of an image of this shape, and as many `more`, can be written under this name.
+
+    Raises
+    ------
+    ValueError, FileNotFoundError, PermissionError, OSError
+        No name; its folder is missing, cannot be written to, or has too little space left.
+    """
+    folder, base = os.path.split(imagename)
+    folder = folder or "."
+    if not base:
+        raise ValueError(f"imagename = '{imagename}' is not a name: it takes the images' common root, as 'run/source'")
+    if not os.path.isdir(folder):
+        raise FileNotFoundError(f"imagename = '{imagename}': the folder '{folder}' does not exist")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise PermissionError(f"imagename = '{imagename}': the folder '{folder}' cannot be written to")
+    needed, free = _bytes_needed(shape, more), shutil.disk_usage(folder).free
+    if free < needed:
+        space = f"the images take {needed / 1e6:.1f} MB, '{folder}' has {free / 1e6:.1f} MB left"
+        raise OSError(errno.ENOSPC, f"imagename = '{imagename}', imsize = {list(shape)}: {space}; free some, or choose "
+                                    "another folder")
+
+
+def _bytes_needed(shape, more=0):
+    """Return the size of all products and `more` images: pixels, masks, and what is around them."""
+    return ((len(PRODUCTS) + more) * 4 + 3 + more) * math.prod(shape) + 2_000_000
+
+
+def _folder_of(imagename, stage):
+    """Return the folder of one stage: '.new', '.whole', '.moving' or '.old'."""
+    folder, base = os.path.split(imagename)
+    return os.path.join(folder, f".{base}{stage}")
+
+
+@contextmanager
+def new_products(imagename):
+    """Yield the name under which to write the products; they take their places when all are complete.
+
+    Those of an older run are replaced, all together; when something fails, everything stays as it was. The folder
+    of the report, where others may have put files, is left to who writes reports.
+    """
+    recover_products(imagename)
+    new = _folder_of(imagename, ".new")
+    os.mkdir(new)
+    try:
+        yield os.path.join(new, os.path.basename(imagename))
+    except BaseException:
+        shutil.rmtree(new, ignore_errors=True)
+        raise
+    with signals_deferred():
+        os.rename(new, _folder_of(imagename, ".whole"))
+        _take_places(imagename)
+
+
+def recover_products(imagename):
+    """Complete or remove the products of a run of this name that was killed while it wrote them."""
+    shutil.rmtree(_folder_of(imagename, ".new"), ignore_errors=True)
+    _take_places(imagename)
+
+
+def _take_places(imagename):
+    """Replace the products by those in '.whole', or continue an interrupted replacement."""
+    whole, moving, old = (_folder_of(imagename, stage) for stage in (".whole", ".moving", ".old"))
+    if os.path.isdir(whole):  # what stands under the name is older
+        os.makedirs(old, exist_ok=True)
+        for path in existing_products(imagename):
+            if not path.endswith(REPORT):
+                os.rename(path, os.path.join(old, os.path.basename(path)))
+        os.rename(whole, moving)
+    if os.path.isdir(moving):
+        for name in os.listdir(moving):
+            os.rename(os.path.join(moving, name), os.path.join(os.path.dirname(imagename), name))
+        os.rmdir(moving)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _sync(folder):
+    """Bring files and folders to the disk, so that a power failure does not undo the order of events."""
+    for parent, _, names in os.walk(folder):
+        for path in [parent, *(os.path.join(parent, name) for name in names)]:
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+
+
+def write_products(output, plane, images, sumwt, beam, record=None, child=None):
+    """Write the products of a run, as tclean does.
+
+    Parameters
+    ----------
+    output : casa_sara.options.Output
+        Its `imagename`, `restoringbeam` and `history`, lines for the history of every image.
+    plane : ImagePlane
+    images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
+        'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
+        residual in Jy/beam) and 'model' in Jy/pixel; 'mask' where there is one.
+    sumwt : float, or one for each channel
+    beam : dict
+        Of `restore.fit_beam`, or a list with one for each channel.
+    record : dict, optional
+        Kept as `RECORD`.
+    child : Popen, optional
+        Of `child.waiting_child`, to write in.
+
+    Raises
+    ------
+    OSError
+        The images could not be written, as on a full disk; everything is as it was before.
+    """
+    more = 2 * output.pbcor + ("mask" in images)
+    check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
+    with new_products(output.imagename) as root:
+        try:
+            in_child(write_images, child, root=root, plane=vars(plane), images=images, sumwt=np.asarray(sumwt, np.float32),
+                     beam=beam, restoringbeam=output.restoringbeam, history=output.history, pbcor=output.pbcor)
+            if record is not None:
+                jsonfile.save(root + RECORD, record)
+            _sync(os.path.dirname(root))
+        except (ChildError, OSError) as error:
+            raise _not_written(output.imagename, _bytes_needed(plane.pb.shape, more), os.path.dirname(root), error) from error
+
+
+def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor=False):
+    """Write the images under the name `root`: what `write_products` has a child process do."""
+    plane = ImagePlane(**plane)
+    write_image(root + ".psf", images["psf"], plane, beam=beam)
+    write_image(root + ".residual", images["residual"], plane, masked=plane.masks_all)
+    write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
+    write_image(root + ".pb", plane.pb, plane, masked=True)
+    write_image(root + ".sumwt", sumwt.reshape(-1, 1, 1), plane)
+    if restoringbeam is not None:
+        restore(root, restoringbeam, "cube" if plane.pb.ndim == 3 else "mfs")
+    if "mask" in images:
+        write_image(root + ".mask", images["mask"], plane)
+    if pbcor:
+        write_corrected(root, plane, images["model"])
+    for path in existing_products(root):
+        with opened("image", path) as ia:
+            ia.sethistory(origin="tsara", history=list(history))
+
+
+def _not_written(imagename, needed, scratch, error):
+    """Return the error why the images were not written: a full disk, or the error of CASA."""
+    folder, free = os.path.dirname(imagename) or ".", shutil.disk_usage(scratch).free
+    written = sum(os.lstat(os.path.join(parent, name)).st_blocks * 512
+                  for parent, _, names in os.walk(scratch) for name in names)
+    if free + written < needed:
+        return OSError(errno.ENOSPC, f"imagename = '{imagename}': '{folder}' filled up while the images were written: "
+                       f"of {needed / 1e6:.1f} MB they had {written / 1e6:.1f} MB, and {free / 1e6:.1f} MB are left")
+    return OSError(errno.EIO, f"imagename = '{imagename}': the images could not be written in '{folder}': {error}")
+
+
+def history_lines(taskname, parameters):
+    """Return the lines that a CASA task writes into the history of its images.
+
+    Parameters
+    ----------
+    taskname : str
+    parameters : dict
+        Task parameters, in order.
+    """
+    import casatools
+
+    lines = [f"taskname={taskname}", f"version: casa_sara {__version__}, CASA {casatools.version_string()}"]
+    for name, value in parameters.items():
+        lines.append(f"{name:<11} = " + (f'"{value}"' if isinstance(value, str) else str(value)))
+    return lines

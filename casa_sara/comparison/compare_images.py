@@ -1,0 +1,362 @@
+"""One comparison of images: read, regrid, make all residuals with one operator, measure."""
+
+from __future__ import annotations
+
+import os
+from importlib.metadata import version
+
+import numpy as np
+
+from casa_sara.analysis import metrics
+from casa_sara.analysis.areas import Frame, places, region_masks
+from casa_sara.analysis.comparison import Comparison, Product
+from casa_sara.analysis.measuring import measure, source_support
+from casa_sara.casa.images.fits_files import is_fits
+from casa_sara.casa.images.image_plane import define_image_plane
+from casa_sara.casa.images.image_sets import check_same_data, data_names, read_frames, read_image_set
+from casa_sara.casa.images.restore import fit_beam
+from casa_sara.casa.images.sky_image import SkyPlane, beam_numbers, read_sky_image
+from casa_sara.casa.images.spectral_index import with_spectrum
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import dirty_image, imaging_weights
+from casa_sara.casa.runtime import log
+from casa_sara.comparison.injection import Injection, can_be_repeated, recover, spectral_index_of
+from casa_sara.data.blocks import snapshot_blocks
+from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.widefield import WTerm
+from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
+from casa_sara.reconstruction.compile_cache import kernels_loading
+from casa_sara.version import __version__
+
+__all__ = ["compare_images"]
+
+INJECTED = 100.0  # flux of an injected source, in units of the noise per beam with natural weights
+IMAGE_EPS = 1e-6  # accuracy of the residual images
+SMALLEST_W_PHASE = 0.01  # rad, in the corners of the image, that is worth the w-term
+LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a note
+ARCSEC = np.radians(1 / 3600)
+RADESYS = {"J2000": "FK5", "ICRS": "ICRS", "B1950": "FK4", "B1950_VLA": "FK4"}
+VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
+
+
+def compare_images(request: Comparing, selection: Selection | None = None, single: bool = False) -> Comparison:
+    """Compare the images that several imagers made of one sky.
+
+    The pixels of the first model are the common grid; if it is turned, mirrored or not in SIN projection, pixels of this
+    size with x to the west and y to the north. With a selection of visibilities, the residual of every model is
+    made of them with one operator and one set of weights; without, the residual images beside the models are used.
+
+    Parameters
+    ----------
+    request : Comparing
+    selection : Selection, optional
+    single : bool
+        One product will do, for the report of one run.
+
+    Returns
+    -------
+    Comparison
+
+    Raises
+    ------
+    ValueError, FileNotFoundError
+        The products cannot be compared; the message names the task parameter.
+    """
+    sets = _read(request, selection is None, 1 if single else 2)
+    first, notes = sets[0].model, []
+    if first.plane.frame not in RADESYS:
+        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or B1950")
+    if RADESYS[first.plane.frame] == "FK4":
+        notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
+    frames = read_frames(request.frames, first.plane.upright())
+    # one grid
+    observed = _Observed(selection, first.plane.upright(), request, sets, notes) if selection else None
+    plane = observed.plane if observed else _common_plane(sets, notes)
+    models = {one.name: _on_grid(one.model, plane, first, "models", notes) for one in sets}
+    truth = _truth(request, plane, first, notes)
+    frame = _frame(plane)
+    regions = region_masks(request.regions, frame)
+    injected = _places_to_inject(request, frame, sets, observed)
+    # one operator
+    if observed:
+        notes.extend(_other_data(sets, selection))
+        beams, residuals, chi_square = observed.measured(sets, models)
+    else:
+        check_same_data(sets)
+        beams, residuals, chi_square = *_beside(sets, plane, notes), {}
+    # measure
+    products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
+    support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
+    measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
+    if injected:
+        _inject(injected, plane, request, selection, sets, beams, measures["products"])
+    for note in notes:
+        log.warn(note)
+    versions = {"casa_sara": __version__} | {name: version(name) for name in VERSIONS}
+    return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures, versions,
+                      tuple(notes), frames)
+
+
+def _common_plane(sets, notes):
+    """Return the grid of the first model, upright; if one is turned, without the edges that not all images reach."""
+    plane = sets[0].model.plane.upright()
+    turned = any(one.model.plane.upright() is not one.model.plane for one in sets)
+    return _covered(plane, sets, notes) if turned else plane
+
+
+def _truth(request, plane, first, notes):
+    """Return the true sky on the common grid, Jy/pixel, None where none is given."""
+    if not request.truth:
+        return None
+    return _on_grid(read_sky_image(request.truth, "truth", ("Jy/pixel",)), plane, first, "truth", notes)
+
+
+def _frame(plane):
+    """Return the coordinates of the common grid."""
+    centre_deg = tuple(np.degrees(plane.centre).tolist())
+    cell_arcsec = tuple((np.array(plane.cell_rad) / ARCSEC).tolist())
+    return Frame(centre_deg, cell_arcsec, plane.shape, RADESYS[plane.frame])
+
+
+def _places_to_inject(request, frame, sets, observed):
+    """Return the pixel coordinates of the point sources to inject, by name; raise where no run can be repeated."""
+    injected = places(request.inject, frame, "inject")
+    if injected and not (observed and any(can_be_repeated(one) for one in sets)):
+        raise ValueError(f"inject = {list(injected)}: needs vis, and images of tsara with their history among models; "
+                         "images of other imagers cannot be made again")
+    return injected
+
+
+def _read(request, with_residual, fewest):
+    """Read the products and give them different names."""
+    models, names = request.models, request.names
+    if len(models) < fewest:
+        raise ValueError(f"models = {list(models)}: should be {fewest} or more products to compare")
+    if names and len(names) != len(models):
+        raise ValueError(f"names = {list(names)}: {len(names)} for {len(models)} models; should be one each, or none")
+    if len(set(names)) < len(names) or any("|" in name or not name.strip() for name in names):
+        raise ValueError(f"names = {list(names)}: should differ, not be empty, and hold no '|'")
+    sets = [read_image_set(given, name, with_residual) for given, name in zip(models, names or [""] * len(models))]
+    taken = set()
+    for number, one in enumerate(sets):
+        name = one.name.replace("|", "_")
+        tries = [name, os.path.normpath(models[number]).replace("|", "_")]
+        tries += [f"{name} {n}" for n in range(2, len(sets) + 2)]
+        sets[number] = one.called(next(word for word in tries if word not in taken))
+        taken.add(sets[number].name)
+    return sets
+
+
+def _on_grid(image, plane, first, parameter, notes):
+    """Return a model on the common grid, with notes about the regridding."""
+    if not image.overlaps(plane):
+        raise ValueError(f"{parameter}: '{image.name}' does not overlap '{first.name}' on the sky: should be images of "
+                         "one field")
+    if not image.pixels.any():
+        raise ValueError(f"{parameter}: '{image.name}' is zero everywhere: should be a model with emission")
+    model = image.flux_on(plane)
+    total = float(np.abs(image.pixels).sum(dtype=float))
+    lost = 1 - float(np.abs(model).sum()) / total
+    if not model.any():
+        raise ValueError(f"{parameter}: '{image.name}' has no flux within '{first.name}': should show the same sky")
+    if model.shape != image.pixels.shape or not np.array_equal(model, image.pixels):
+        grid = "pixels along right ascension and declination" if image is first else f"the pixels of '{first.name}'"
+        notes.append(f"'{image.name}' was regridded to {grid}, with its flux conserved")
+        if lost > LOST:
+            notes.append(f"{100 * lost:.2g} % of the flux of '{image.name}' cancels or lies outside of '{first.name}'")
+    return model
+
+
+def _other_data(sets, selection):
+    """Say which products were not made of just these visibilities."""
+    given = data_names(selection.vis)
+    for one in sets:
+        if one.data and one.data != given:
+            theirs, ours = (", ".join(sorted(names)) for names in (one.data, given))
+            yield f"'{one.name}' was made from {theirs}, and is compared with {ours} like the others"
+        if one.record.get("wild"):
+            yield f"{len(one.record['wild'])} outliers that '{one.name}' left out are included in the residuals of all"
+
+
+def _product(one, model, residuals, beams, cell_arcsec):
+    """Return a product with its restored images, model ∗ beam + residual."""
+    restored = {}
+    for weighting, residual in residuals.items():
+        *axes, angle = beams[weighting]
+        smoothed = metrics.smooth(model, axes, angle, cell_arcsec) * metrics.beam_pixels(axes, cell_arcsec)
+        restored[weighting] = smoothed + residual
+    return Product(one.name, model, residuals, restored, dict(one.parameters), dict(one.record))
+
+
+def _support(request, plane, frame, models, truth, beam, notes):
+    """Return the support of the source, from a mask image, a region or the threshold."""
+    text = request.support
+    if not text:
+        return source_support(models, truth, request.threshold, beam, frame.cell_arcsec)
+    if os.path.isdir(text) or is_fits(text) or text.endswith((".fits", ".mask")):
+        image = read_sky_image(text, "support", None)
+        support = np.zeros(plane.shape, bool)
+        if image.overlaps(plane):
+            support = np.nan_to_num(image.brightness_on(plane)) > 0.5
+    else:
+        support = np.any(list(region_masks([text], frame, "support").values()), axis=0)
+    if support.all() or not support.any():
+        raise ValueError(f"support = '{text}' holds {support.sum()} of {support.size} pixels of the image: should be a "
+                         "part of it, above 0.5 in a mask image")
+    outside = max(model[~support].max() / model.max() for model in models)
+    if outside > 0.5:
+        notes.append(f"support = '{text}' excludes a pixel with {100 * outside:.2g} % of the peak of a model: please check it")
+    return support
+
+
+def _inject(injected, plane, request, selection, sets, beams, measured):
+    """Add the measures of the injected point sources."""
+    again = [one for one in sets if can_be_repeated(one)]
+    flux = request.injectflux or INJECTED * max(measured[one.name]["natural"]["sigma"] for one in again)
+    widths = {weighting: float(np.sqrt(beam[0] * beam[1])) for weighting, beam in beams.items()}
+    injection = Injection(injected, plane, flux, min(widths.values()))
+    for one in again:
+        found = recover(one, injection, selection, request.nthreads)
+        for source in found.values():
+            if "fwhm_arcsec" in source:
+                source["fwhm_in_beams"] = {name: source["fwhm_arcsec"] / width for name, width in widths.items()}
+        measured[one.name]["injected"] = found
+
+
+def _covered(plane, sets, notes):
+    """Return the plane without edges that an existing residual image does not cover, such as one that is rotated."""
+    known = np.ones(plane.shape, bool)
+    for one in sets:
+        if one.residual is not None and one.residual.overlaps(plane):
+            known &= np.isfinite(one.residual.brightness_on(plane))
+    nx, ny = plane.shape
+    edges = ((x, x * ny // nx) for x in range(nx // 2))
+    x, y = next(((x, y) for x, y in edges if known[x : nx - x, y : ny - y].all()), (0, 0))
+    if not x:
+        return plane
+    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, which the residual images cover; with vis all of the "
+                 "first model is compared")
+    return plane.trimmed((x, y))
+
+
+def _beside(sets, plane, notes):
+    """Return the beams and the residuals by product and weighting, from the existing images of the products."""
+    beams, residuals = {}, {one.name: {} for one in sets}
+    for one in sets:
+        if one.residual is None:
+            notes.append(f"'{one.name}' has no residual image; with vis one is made")
+            continue
+        if one.beam is None:
+            raise ValueError(f"models: '{one.residual.name}' has no beam, and there is no image or PSF with a beam: give "
+                             "vis, or add the restored image")
+        image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
+        if not np.isfinite(image).all():
+            covered = 100 * np.isfinite(image).mean()
+            raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{sets[0].model.name}' and cannot "
+                             "be put on its pixels: give vis, and the residuals are made there")
+        weighting = "briggs" if one.weighting in ("briggs", "uniform") else "natural"
+        if one.weighting not in ("briggs", "natural"):
+            known = f"weighting '{one.weighting}'" if one.weighting else "an unknown weighting"
+            notes.append(f"the residual of '{one.name}' has {known}; it is listed under {weighting}")
+        beam = beams.setdefault(weighting, one.beam)
+        if not np.allclose(beam[:2], one.beam[:2], rtol=1e-2):
+            notes.append(f"'{one.name}' has another beam, {one.beam[0]:.3g} x {one.beam[1]:.3g} arcsec; with vis "
+                         "the residuals of all have the same beam")
+        residuals[one.name][weighting] = image
+    if not beams:
+        beam = next((one.beam for one in sets if one.beam), None)
+        if beam is None:
+            raise ValueError("models: none of them has an .image, .residual or .psf with a beam: give vis, or "
+                             "add a restored image")
+        beams["natural"] = beam
+    return beams, residuals
+
+
+class _Observed:
+    """Visibilities, and the residuals of models, always with the same operator and the same weights.
+
+    Attributes
+    ----------
+    plane : SkyPlane
+        The common grid.
+    beams : dict
+        Weighting → major, minor in arcsec and position angle in degrees, fitted to the PSF.
+    """
+
+    def __init__(self, selection, plane, request, sets, notes):
+        longitude, latitude = (float(angle) for angle in plane.centre)
+        grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
+        with kernels_loading(log.info):
+            data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
+        notes.extend(data.notes)
+        self._gridder = _common_gridder(sets, data.max_w, plane, notes)
+        image_plane = define_image_plane(data, selection, grid)
+        notes.extend(image_plane.notes)
+        self.plane, self._data, self._nthreads = SkyPlane(image_plane.csys, plane.shape), data, request.nthreads
+        self._operators = {}
+        operator = self._operator(self.plane, "models")
+        self._weights = {"natural": imaging_weights(data, grid, Weighting("natural")),
+                         "briggs": imaging_weights(data, grid, Weighting("briggs", request.robust))}
+        ones = np.ones(data.size, np.complex64)
+        self.beams = {weighting: beam_numbers(fit_beam(dirty_image(operator, ones, weights), image_plane))
+                      for weighting, weights in self._weights.items()}
+        self._block_of_sample, blocks = snapshot_blocks(data)
+        self._samples = np.array([block.samples for block in blocks])
+
+    def measured(self, sets, models):
+        """Return the beams, and by product the residual images and χ² of the blocks, of models on the common grid."""
+        residuals, chi_square = {}, {}
+        for one in sets:
+            left = self.minus(one, models[one.name])
+            residuals[one.name], chi_square[one.name] = self.images(left), self.chi_square(left)
+        return self.beams, residuals, chi_square
+
+    def images(self, left):
+        """Return the residual images by weighting, in Jy/beam, of residual visibilities."""
+        operator = self._operator(self.plane, "models")
+        return {weighting: dirty_image(operator, left, weights).astype(float)
+                for weighting, weights in self._weights.items()}
+
+    def chi_square(self, left):
+        """Return Σ w|r|² / 2N of each block of residual visibilities: 1 for noise as given by the MS weights."""
+        power = self._data.weight * np.abs(left) ** 2
+        return np.bincount(self._block_of_sample, power, self._samples.size) / (2 * self._samples)
+
+    def minus(self, one, model):
+        """Return the data minus the visibilities of a product's model, which is given on the common grid.
+
+        They are predicted from its own pixels where these have the common centre: regridding would blur it. A model of a
+        known spectral index keeps its spectrum.
+        """
+        image = one.model
+        plane, pixels = (image.plane, image.pixels) if image.plane.is_aligned(self.plane) else (self.plane, model)
+        operator = self._operator(plane, f"models: '{image.name}'", spectral_index_of(one), image.plane)
+        return self._data.vis - operator.forward(np.asarray(pixels, np.float32))
+
+    def _operator(self, plane, what, spectralindex="", reference=None):
+        key = plane.shape, plane.cell_rad, spectralindex
+        if key not in self._operators:
+            grid = ImageGrid(plane.shape, plane.cell_rad, gridder=self._gridder, spectralindex=spectralindex)
+            if spectralindex:  # at the frequency of the model, not at that of the common grid
+                grid = with_spectrum(grid, plane, reference)
+            try:
+                self._operators[key] = sky_operator(self._data.uvw, grid, self._data.freq_hz, eps=IMAGE_EPS,
+                                                    nthreads=self._nthreads)
+            except ValueError as error:
+                raise ValueError(f"{what}: its visibilities cannot be computed for vis: {error}") from error
+        return self._operators[key]
+
+
+def _common_gridder(sets, max_w, plane, notes):
+    """Return the measurement operator for the residuals of all products, with a note about the reason.
+
+    That is without the w-term where all were imaged without it, or where it is nothing; else with it.
+    """
+    phase = WTerm.of(max_w, plane.shape, plane.cell_rad, IMAGE_EPS).phase
+    without = [one.name for one in sets if one.parameters.get("gridder", "") == "standard"
+               or one.parameters.get("taskname") == "tsara" and "gridder" not in one.parameters]
+    if len(without) == len(sets) or phase < SMALLEST_W_PHASE:
+        return "standard"
+    notes.append(f"the residuals of all are made with the w-term, which changes phases by up to {phase:.2g} rad in this image"
+                 + "".join(f"; '{name}' was imaged without it" for name in without))
+    return "wproject"

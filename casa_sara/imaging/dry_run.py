@@ -1,0 +1,138 @@
+"""Before a run: a forecast of its memory and, for a dry run, of its time."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+
+from casa_sara.casa.images.image_plane import define_image_plane
+from casa_sara.casa.images.spectral_axis import channels_of, samples_of_channels, spectral_axis
+from casa_sara.casa.images.spectral_index import spectral_band, with_spectrum
+from casa_sara.casa.ms.block_selection import divide
+from casa_sara.casa.ms.data_volume import measure_volume
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.selection import select_data
+from casa_sara.casa.runtime import log
+from casa_sara.data.visibilities import sort_into_blocks
+from casa_sara.imaging.load_balance import assign_ranks
+from casa_sara.imaging.memory_forecast import Workload, forecast
+from casa_sara.imaging.time_forecast import measure
+from casa_sara.operators.measurement import check_field
+from casa_sara.parallel.serial import SERIAL
+from casa_sara.reconstruction.compile_cache import kernels_loading
+from casa_sara.runtime.machine import available_memory, resident_memory
+
+__all__ = ["forecast_run", "dry_run"]
+
+WRITER = 130_000_000  # bytes of the process that writes the images, while it waits
+
+
+def forecast_run(selection, grid, options, limits, comm=SERIAL):
+    """Share a run among the ranks, and forecast the memory of this one, from the numbers of rows, channels and pixels.
+
+    Rank 0 says its own in the log. Flags are read only where the run would not fit with all samples.
+
+    Returns
+    -------
+    casa_sara.imaging.memory_forecast.Forecast
+    casa_sara.parallel.partition.RankAssignment
+    """
+    resident, available = resident_memory(), (available_memory() - WRITER) // comm.node_size
+    channels, share = _channels(selection, grid)
+    for flags in (False, True):
+        volume = comm.once(measure_volume, selection, flags, grid.stokes)
+        if any(volume.reach):  # else there is nothing to read, which reading explains
+            check_field(math.hypot(*volume.reach), grid.shape, grid.cell_rad)
+        band = spectral_band(grid, volume.freq_range_hz)
+
+        def memory_of(ranks, volume=volume, band=band):
+            work = Workload.of(volume, grid, options, limits.report, band, channels, share, ranks)
+            return forecast(work, resident, available, limits.maxmem_gb)
+
+        ranks = assign_ranks(comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
+        found = memory_of(ranks)
+        if all(comm.allgather(found.fits)):
+            break
+    for line in found.lines():
+        log.info(line)
+    return found, ranks
+
+
+def _channels(selection, grid):
+    """Return how many channels a cube will have, and the share of the samples in the one with most; else 0 and 1."""
+    if not grid.is_cube:
+        return 0, 1.0
+    axis = spectral_axis(selection, grid)
+    samples = samples_of_channels(selection, axis)
+    everything = sum(group.rows.size * group.channels.size for ms in select_data(selection)[0] for group in ms.groups)
+    if not samples.any():
+        raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no data are in these "
+                         "channels")
+    return axis.size, float(samples.max() / everything)
+
+
+def _fullest_channel(data, selection, grid):
+    """Return the samples of the channel of a cube that has most."""
+    channel = channels_of(data, selection, spectral_axis(selection, grid))
+    count = np.bincount(channel[channel >= 0], minlength=1)
+    return data.part(np.flatnonzero(channel == count.argmax()))
+
+
+def dry_run(selection, grid, options, blocks, limits):
+    """Forecast the memory of a run by part and, where it fits, its time from a short measurement.
+
+    Nothing is written.
+
+    Parameters
+    ----------
+    selection, grid, options
+        As of :func:`casa_sara.imaging.continuum.make_image`.
+    blocks : int or tuple of str
+        As of :class:`casa_sara.options.Output`.
+    limits : casa_sara.options.Limits
+
+    Returns
+    -------
+    dict
+        See :meth:`casa_sara.imaging.memory_forecast.Forecast.summary`, with `seconds` of each part and `iterations`; `reason` instead where it
+        does not fit.
+    """
+    with kernels_loading(log.info):
+        found, _ = forecast_run(selection, grid, options, limits)
+    if not found.fits:
+        try:
+            found.require(limits.maxmem_gb)
+        except MemoryError as error:
+            log.warn(str(error))
+            return found.summary() | {"reason": str(error)}
+    start = time.perf_counter()
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
+    if grid.spectralindex:
+        grid = with_spectrum(grid, define_image_plane(data, selection, grid))
+    everything = data.size
+    if grid.is_cube:
+        data = _fullest_channel(data, selection, grid)
+    data, offsets = sort_into_blocks(data, divide(data, blocks)[0])
+    timing = measure(data, offsets, grid, options, time.perf_counter() - start)
+    timing = replace(timing, channels=max(found.workload.channels, 1))
+    for line in _time_lines(timing):
+        log.info(line)
+    seconds = {name: getattr(timing, name) for name in ("reading", "building", "pair", "nnls_iteration", "iteration",
+                                                        "writing", "total")}
+    return found.summary() | {"visibilities": everything, "iterations": timing.iterations, "seconds": seconds,
+                              "iteration_s": timing.iteration}
+
+
+def _time_lines(timing):
+    """The times as lines of a table."""
+    channels = f" for each of {timing.channels} channels" if timing.channels > 1 else ""
+    yield (f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the number depends on "
+           "the data)")
+    rows = {"reading": timing.reading, "building the operator": timing.building,
+            "one NNLS iteration": timing.nnls_iteration, "one solver iteration": timing.iteration,
+            "writing the images": timing.writing}
+    for name, seconds in rows.items():
+        yield f"  {name:<26}{seconds:10.3f} s"

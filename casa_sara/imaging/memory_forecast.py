@@ -1,0 +1,291 @@
+"""Forecast of the memory of a run, by part, before anything is read."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+from casa_sara.operators.dictionary import coefficient_bytes
+from casa_sara.operators.measurement import grid_bytes
+from casa_sara.operators.sky import further_bytes
+from casa_sara.parallel.partition import ALONE
+
+__all__ = ["Forecast", "Workload", "forecast"]
+
+# bytes of one visibility; docs/reliability.md, "Forecast", has the measurement
+SAMPLE = 46  # Visibilities: vis, two weights, uvw, row, chan
+FREQUENCY = 4  # of a sample, where they are kept
+READING = 62  # chunks, and one column joined
+POINT = 28  # of the operator: NonUniformFFT's Points
+PLANNING = 64  # frequencies and factors, while the operator is built
+SOLVER = 48  # whitened data, density, preconditioner, dual, Φx̄, Φz, weights
+PASSING = 12  # weights of a pass between the iterations
+WEIGHING = 30  # uv cells and densities
+SORTING = 12  # of a cube: channels of the samples, and their order
+CHECKPOINT = 16  # the dual and Φz
+# image planes, each 4 bytes a pixel
+PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
+NORM, NNLS, SOLVING, WRITING = 8, 4, 9, 10
+MATCHED = 13  # of the matched filters, while the support is found
+CUBES = 3  # psf, residual and model of each channel
+DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
+LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
+REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one visibility, image planes
+
+@dataclass(frozen=True)
+class Workload:
+    """What memory depends on; `reach` is the largest |u| and |v| in wavelengths, `max_w` the largest |w|.
+
+    `frequencies` tells whether the samples keep theirs, for a spectral index; `band` is the largest |ln(ν/ν0)| where that is an
+    image, else 0. A cube has `channels`, and `share` of the samples are in the one with most.
+    """
+
+    samples: int
+    reach: tuple[float, float]
+    shape: tuple[int, int]
+    cell_rad: tuple[float, float]
+    n_bases: int
+    levels: int
+    niter: int
+    nthreads: int
+    precondition: bool = True
+    report: bool = False
+    gridder: str = "standard"
+    max_w: float = 0.0
+    frequencies: bool = False
+    band: float = 0.0
+    channels: int = 0
+    share: float = 1.0
+    masked: bool = False
+    whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
+    confined: bool = False
+    duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
+
+    @classmethod
+    def of(cls, volume, grid, options, report=False, band=0.0, channels=0, share=1.0, ranks=ALONE):
+        """The workload of this rank: its share of the data that were counted (`volume`), and the task's parameters."""
+        writes, bases = ranks.comm.rank == 0, len(options.wavelets)
+        return cls(math.ceil(volume.samples * ranks.share), volume.reach, grid.shape, grid.cell_rad,
+                   len(ranks.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
+                   options.precondition, report and writes, grid.gridder, volume.max_w, bool(grid.spectralindex), band,
+                   channels, share, grid.masked, (volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
+                   options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
+                   3 if options.method == "dabbech2018" else 2)
+
+    def memory(self):
+        """Return phase → part → bytes, in addition to what the process holds before it reads."""
+        return self._of_cube() if self.channels else self._of_plane()
+
+    def _of_cube(self):
+        """The phases of the fullest channel, beside all data and the cubes; all is read and written at once."""
+        one = replace(self, samples=math.ceil(self.samples * self.share), channels=0).memory()
+        one.pop("reading")
+        writing = one.pop("writing")
+        held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
+                "cubes": self._planes((PLANE + CUBES) * self.channels)}
+        reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples,
+                   "while reading": READING * self.samples}
+        return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
+                "images of a channel": writing | held,
+                "writing": {"libraries": LIBRARIES, **held,
+                            "process that writes": self._planes((PLANE + CUBES + 1) * self.channels)}}
+
+    def _of_plane(self):
+        """The phases of one plane, in their order."""
+        data = self._data()
+        held = data | {"image planes": self._planes(PLANE)}
+        with_operator = held | {"operator": self._operator(self.band)}
+        phases = {"reading": data | {"while reading": READING * self.samples}}
+        if self.niter > 0:
+            phases |= self._solving(held, with_operator)
+        phases["writing"] = self._writing(with_operator)
+        if self.report:
+            phases["report"] = self._reporting()
+        return phases
+
+    def _data(self):
+        return {"libraries": LIBRARIES, "visibilities": (SAMPLE + FREQUENCY * self.frequencies) * self.samples}
+
+    def _solving(self, held, with_operator):
+        """The phases from the density of the samples to the writing of a checkpoint."""
+        coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
+        with_solver = with_operator | {"solver's visibilities": SOLVER * self.samples}
+        iterating = with_solver | {
+            "image planes": self._planes(PLANE + SOLVING + MATCHED * self.confined),
+            "re-weighting": PASSING * self.samples, "wavelet duals and weights": self.duals * coefs,
+            "wavelet workspace": workspace}
+        phases = {}
+        if self.precondition:
+            cells = DENSITY_CELL * self._side() ** 2
+            phases["density of samples"] = held | {"uv grid": WEIGHING * self.samples + cells}
+        phases["building the operator"] = with_operator | {"while planning": PLANNING * self.samples}
+        phases["NNLS"] = with_solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
+        phases["iterating"] = iterating
+        if any(self.whole):
+            samples, bases = self.whole
+            duals_and_weights = 2 * coefficient_bytes(self.shape, bases, self.levels)[0]
+            phases["writing a checkpoint"] = iterating | {
+                "gathered of all ranks": 2 * (CHECKPOINT * samples + duals_and_weights)}
+        return phases
+
+    def _writing(self, with_operator):
+        parts = with_operator | {"while planning": PLANNING * self.samples,
+                                 "image planes": self._planes(PLANE + WRITING)}
+        return parts | {"operator of flat spectra": self._operator()} if self.frequencies else parts
+
+    def _reporting(self):
+        """The report has the operator of all ranks' samples, and draws them."""
+        samples = max(self.samples, self.whole[0])
+        parts = replace(self, samples=samples, report=False).memory()["writing"]
+        del parts["while planning"]
+        return parts | {"drawing": REPORT + REPORT_SAMPLE * samples, "image planes": self._planes(REPORT_PLANES)}
+
+    def _operator(self, band=0.0):
+        """Bytes of the measurement operator; `band` of an image of spectral indices, 0 for flat spectra."""
+        return POINT * self.samples + self._grid() + further_bytes(self.samples, self, self.max_w, band)
+
+    def _planes(self, count):
+        return int(4 * (count + SUPPORT * self.masked) * math.prod(self.shape))
+
+    def _side(self):
+        cell = min(self.cell_rad)
+        return math.ceil(max(n * c for n, c in zip(self.shape, self.cell_rad)) / cell)
+
+    def _grid(self):
+        if self.samples == 0:
+            return 0
+        reach = [min(max(wave * cell, 1e-6), 0.5) for wave, cell in zip(self.reach, self.cell_rad)]
+        return grid_bytes(self.samples, reach, self.shape)
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Memory that a workload needs, and what there is.
+
+    Attributes
+    ----------
+    workload : Workload
+    phases : dict
+        Phase → part → bytes.
+    resident : int
+        Bytes that the process holds before.
+    room : int
+        Bytes that it may take in addition.
+    iteration_s : float
+        Seconds of one iteration, NaN where it was not measured.
+    """
+
+    workload: Workload
+    phases: dict[str, dict[str, int]]
+    resident: int
+    room: int
+    iteration_s: float = math.nan
+
+    @property
+    def peak_phase(self) -> str:
+        """The phase that needs most."""
+        return max(self.phases, key=lambda phase: sum(self.phases[phase].values()))
+
+    @property
+    def needed(self) -> int:
+        """Bytes that the run takes in addition to what the process holds."""
+        return sum(self.phases[self.peak_phase].values())
+
+    @property
+    def fits(self) -> bool:
+        """Whether there is room."""
+        return self.needed <= self.room
+
+    def lines(self):
+        """The memory as lines of a table, for the log."""
+        work, parts = self.workload, self.phases[self.peak_phase]
+        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak (phase: {self.peak_phase}) for "
+               f"{work.shape[0]} x {work.shape[1]} pixels{self._channels()} and {work.samples} visibilities; "
+               f"{self.resident / 1e9:.2f} GB are in use now, and {self.room / 1e9:.2f} GB more are available:")
+        for part, size in parts.items():
+            yield f"  {part:<26}{size / 1e6:10.1f} MB"
+        yield f"  {'total':<26}{self.needed / 1e6:10.1f} MB"
+
+    def _channels(self):
+        return f" in {self.workload.channels} channels" if self.workload.channels else ""
+
+    def summary(self):
+        """Return what the returned dictionary says of it: sizes in bytes."""
+        return {
+            "imsize": list(self.workload.shape),
+            **({"nchan": self.workload.channels} if self.workload.channels else {}),
+            "visibilities": self.workload.samples,
+            "peak_bytes": self.resident + self.needed,
+            "held_before_bytes": self.resident,
+            "available_bytes": self.room,
+            "fits": self.fits,
+            "peak_phase": self.peak_phase,
+            "memory_bytes": {phase: dict(parts) for phase, parts in self.phases.items()},
+            "iteration_s": self.iteration_s,
+        }
+
+    def require(self, maxmem_gb):
+        """Raise MemoryError, with what would fit, unless there is room."""
+        if self.fits:
+            return
+        parts = ", ".join(f"{part} {size / 1e9:.2f}" for part, size in self.phases[self.peak_phase].items())
+        least = self.resident + self.needed
+        limit = f"maxmem = {maxmem_gb:g} GB" if maxmem_gb else "the memory available"
+        raise MemoryError(
+            f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of "
+            f"vis takes {least / 1e9:.2f} GB while {self.peak_phase} ({parts}, in use now {self.resident / 1e9:.2f}); "
+            f"{limit} allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
+
+    def _what_fits(self):
+        """The largest image of this shape, and the most visibilities."""
+        work = self.workload
+
+        def needs(changed):
+            return replace(self, workload=changed, phases=changed.memory()).fits
+
+        def scaled(part):
+            return replace(work, shape=tuple(max(1, int(n * part) // 2 * 2) for n in work.shape))
+
+        part = _largest(lambda x: needs(scaled(x)))
+        samples = _largest(lambda x: needs(replace(work, samples=max(1, int(work.samples * x)))))
+        ways = []
+        if part:
+            ways.append(f"imsize up to {list(scaled(part).shape)}")
+        fewer = _largest(lambda x: needs(replace(work, channels=max(1, int(work.channels * x)))))
+        channels = int(work.channels * fewer)
+        if channels:
+            ways.append(f"nchan up to {channels}")
+        if samples:
+            most = int(work.samples * samples)
+            ways.append(f"at most {most} visibilities (select with spw, scan, …; or average them)")
+        if not ways:
+            return "No image fits, however small and with however few visibilities: more memory is needed"
+        return f"It would fit with {' or '.join(ways)}; fewer wavelets also take less"
+
+
+def forecast(workload, resident, available, maxmem_gb=0.0):
+    """Forecast the memory of a workload.
+
+    Parameters
+    ----------
+    workload : Workload
+    resident, available : int
+        Bytes held by the process, and those that it can take in addition.
+    maxmem_gb : float
+        Most that the process may hold, 0 for no such limit.
+
+    Returns
+    -------
+    Forecast
+    """
+    room = min(available, int(maxmem_gb * 1e9) - resident) if maxmem_gb else available
+    return Forecast(workload, workload.memory(), resident, room)
+
+
+def _largest(fits):
+    """Largest x in (0, 1) that fits, to 1 %; 0 where none does."""
+    low, high = 0.0, 1.0
+    while high - low > 0.01 * high and high > 1e-4:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if fits(middle) else (low, middle)
+    return low

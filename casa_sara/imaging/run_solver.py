@@ -1,0 +1,274 @@
+"""The solution of one image within a run: density of the uv coverage, progress, time limit, checkpoint, outliers."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from casa_sara.casa.images.image_plane import ImagePlane
+from casa_sara.casa.images.island_positions import located
+from casa_sara.casa.images.products import CHECKPOINT
+from casa_sara.casa.ms.weights import sampling_density
+from casa_sara.casa.runtime import log
+from casa_sara.data.visibilities import BlockInfo, Visibilities, clock
+from casa_sara.imaging.time_forecast import Pace
+from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
+from casa_sara.parallel.partition import ALONE, RankAssignment
+from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.problem import Samples
+from casa_sara.reconstruction.reconstruct import Control, Reconstruction, reconstruct, schedule_of
+from casa_sara.runtime.deadline import Deadline
+from casa_sara.runtime.signals import stop_on_interrupt
+from casa_sara.solver.islands import STRUCTURE
+from casa_sara.solver.nnls import NNLS_ITERATIONS
+from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED, SolverRecord
+from casa_sara.version import __version__
+
+__all__ = ["Watch", "checkpoint_of", "density_of", "list_islands", "solve_image", "without_wild"]
+
+MOST_NAMED = 20  # wild samples that the log names one by one
+MOST_TOLD = 20  # islands of emission that the log lists
+
+
+@dataclass
+class Watch:
+    """When a solution has to end, how long an iteration takes, and where its state is kept, or was."""
+
+    deadline: Deadline
+    pace: Pace
+    checkpoint: Checkpoint
+
+
+def checkpoint_of(selection: Selection, grid: ImageGrid, options: SolverOptions, output: Output) -> Checkpoint:
+    """Return the checkpoint of a run, with the task parameters on which the model depends.
+
+    Where the data are is none of them (they are known by their contents), nor is how many threads there are.
+    """
+    startmodel = output.startmodel if output.startmodel != output.imagename + ".model" else ""  # that of restart = True
+    parameters = asdict(selection) | asdict(grid) | asdict(options) | dict(blocks=output.blocks, startmodel=startmodel)
+    parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
+    for name in ("vis", "nthreads", "spectrum"):
+        del parameters[name]
+    return Checkpoint(output.imagename + CHECKPOINT, __version__, parameters, log.info, log.warn)
+
+
+def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid, options: SolverOptions,
+               comm: Serial = SERIAL) -> np.ndarray:
+    """Return the sampling density of each sample, real (M,): 1 where no preconditioner is asked for.
+
+    Parameters
+    ----------
+    data : Visibilities
+    selection : Selection or None
+        That gave the data; None where they are but a part of it.
+    grid : ImageGrid
+    options : SolverOptions
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
+    """
+    if not options.precondition:
+        return np.ones(data.size, np.float32)
+    log.info("computing the density of the uv coverage")
+    return sampling_density(data, selection, grid, comm)
+
+
+def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
+                watch: Watch | None = None, support: np.ndarray | None = None, ranks: RankAssignment = ALONE) -> Reconstruction:
+    """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
+
+    Parameters
+    ----------
+    samples : Samples
+        With the sampling density (:func:`density_of`) and the noise.
+    grid : ImageGrid
+    options : SolverOptions
+    startmodel : float32 (nx, ny), optional
+        First model, Jy/pixel.
+    watch : Watch, optional
+        Without it there is no limit of time and no checkpoint.
+    support : bool (nx, ny), optional
+        The model is 0 elsewhere.
+    ranks : casa_sara.parallel.partition.RankAssignment
+        The ranks that share the work; rank 0 decides when to stop.
+
+    Returns
+    -------
+    Reconstruction
+    """
+    progress = log.Progress()
+    preparing = _Preparing(progress)
+    report = partial(_report, progress, preparing, schedule_of(options).expected_iterations, watch.pace if watch else None)
+    with stop_on_interrupt() as pressed:
+        def stopped():
+            preparing()
+            return bool(ranks.comm.bcast_numbers([pressed() or bool(watch and watch.deadline.near())])[0])
+
+        control = Control(report, stopped, watch.checkpoint if watch else None)
+        if not (control.checkpoint and control.checkpoint.state is not None):
+            progress.prepare("computing the norm of the measurement operator, and the first image by non-negative least squares "
+                             f"(NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
+        reconstruction = reconstruct(samples, grid, options, startmodel, control, support, ranks)
+    progress.close()
+    record = reconstruction.record
+    if record.stop_code == STOPPED_BY_USER and not ranks.comm.bcast(pressed()):
+        record.stop_code = TIME_LIMIT
+    _log_end(reconstruction, samples.offsets, control.checkpoint, ranks.comm)
+    return reconstruction
+
+
+def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd, record):
+    """Show how far the solution is, after every iteration of `expected` ones."""
+    preparing.over = True
+    begun = record.resumed[-1] if record.resumed else 0
+    if pace and (line := pace(ppd.iteration - begun)):
+        log.info(line)
+    fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
+    progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.block_sizes.sum()):.4g}, "
+             f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
+             f"{record.reweighting[-1]} re-weightings", fraction)
+
+
+def _log_end(reconstruction, offsets, checkpoint, comm):
+    """Write to the log why the solution ended and what it found."""
+    record = reconstruction.record
+    say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
+    samples = _samples_of_blocks(reconstruction, offsets, comm)
+    say(f"{record.stop_description}, after {record.iteration[-1]} iterations and {record.reweighting[-1]} re-weightings: "
+        f"reduced chi-square {_reduced(record.residual_norm[-1], samples.sum()):.4g}, model flux "
+        f"{record.model_flux[-1]:.5g} Jy")
+    if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
+        log.info(f"restart = True continues from '{checkpoint.path}'")
+    released = sum(update["released"] for update in record.reweightings)
+    if released:
+        log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie "
+                 "between pixel centres")
+    for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
+        log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
+                 f"{_reduced(norm, samples[j]):.4g}")
+
+
+class _Preparing:
+    """The progress of the NNLS fit, which is asked after every iteration whether to stop.
+
+    Attributes
+    ----------
+    over : bool
+        The iterations of the solver have begun.
+    """
+
+    INTERVAL = 3.0  # s between two lines of the log
+
+    def __init__(self, progress, clock=time.monotonic):
+        self._progress, self._clock, self._iteration, self.over = progress, clock, 0, False
+        self._last = clock()
+
+    def __call__(self):
+        """Count one more iteration."""
+        if self.over:
+            return
+        self._iteration += 1
+        due = self._clock() - self._last >= self.INTERVAL
+        if due:
+            self._last = self._clock()
+        self._progress.prepare(f"NNLS iteration {self._iteration}", due)
+
+
+def _reduced(norm, samples):
+    """Return χ²/2M, the reduced chi-square of M complex samples, of the norm of their whitened residual."""
+    return float(norm) ** 2 / (2.0 * max(int(samples), 1))
+
+
+def _samples_of_blocks(reconstruction, offsets, comm):
+    """Return the number of samples in use of every block, int (d,), on all ranks together."""
+    return comm.allreduce(np.diff(np.searchsorted(reconstruction.kept, offsets)))
+
+
+def without_wild(data: Visibilities, blocks: list[BlockInfo], offsets: np.ndarray, reconstruction: Reconstruction,
+                 comm: Serial = SERIAL) -> tuple[Visibilities, list[BlockInfo]]:
+    """Leave out the outliers that the reconstruction left out, and list them in the log.
+
+    Parameters
+    ----------
+    data : Visibilities
+    blocks : list of d BlockInfo
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    reconstruction : Reconstruction
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    data : Visibilities
+    blocks : list of d BlockInfo
+    """
+    wild = reconstruction.wild
+    if not wild:
+        return data, blocks
+    log.warn(f"{len(wild)} outliers, visibilities that no sky can explain, are left out:")
+    for one in wild[:MOST_NAMED]:
+        log.warn(f"  {one['ms']} row {one['row']}, spw {one['spw']}, channel {one['channel']}, antennas "
+                 f"{one['antenna1']} and {one['antenna2']}, {clock(one['time_mjd_s'])}: {one['amplitude_jy']:.4g} Jy where "
+                 f"the model has {one['predicted_jy']:.4g} Jy")
+    if len(wild) > MOST_NAMED:
+        log.warn(f"  … and {len(wild) - MOST_NAMED} more, which the record lists as 'wild'")
+    samples = _samples_of_blocks(reconstruction, offsets, comm)
+    blocks = [replace(block, samples=int(count)) for block, count in zip(blocks, samples)]
+    return replace(data.take(reconstruction.kept), dropped=data.dropped | {"wild": len(wild)}), blocks
+
+
+def list_islands(record: SolverRecord, plane: ImagePlane, cell_rad: tuple[float, float], significance: float,
+                 comm: Serial = SERIAL) -> None:
+    """Give the islands of a model their sky coordinates, list them in the log, and warn where the residual is not noise.
+
+    Parameters
+    ----------
+    record : SolverRecord
+        Its islands are given `right_ascension` and `declination` (text, in the frame of the image) and `fwhm_arcsec`.
+    plane : ImagePlane
+    cell_rad : (float, float)
+        Pixel size.
+    significance : float
+        That was asked for.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Ranks that share the work.
+    """
+    record.islands = comm.once(located, record.islands, plane, cell_rad)
+    _log_islands(record, significance, cell_rad)
+
+
+def _log_islands(record, significance, cell_rad):
+    """Write the islands to the log, to a hundredth of a pixel, and warn where the residual is not noise."""
+    if not record.residual_snr:
+        return
+    islands = [island for island in record.islands if island["snr"] >= significance]
+    faint = [island["flux_jy"] for island in record.islands if island["snr"] < significance]
+    digits = max(0, 2 - math.floor(math.log10(math.degrees(min(cell_rad)) * 3600)))
+    if not record.islands:
+        log.info(f"no emission of {significance:g} sigma or more: the model is empty")
+    else:
+        log.info(f"{len(islands)} islands of emission of {significance:g} sigma or more"
+                 + (f", the {MOST_TOLD} most significant:" if len(islands) > MOST_TOLD else ":" if islands else ""))
+    for island in islands[:MOST_TOLD]:
+        place = " ".join(_shortened(island[name], digits) for name in ("right_ascension", "declination"))
+        log.info(f"  {place}: {island['flux_jy']:.4g} +- {island['flux_error_jy']:.2g} Jy, S/N {island['snr']:.3g}, "
+                 f"FWHM {island['fwhm_arcsec']:.3g} arcsec")
+    if faint:
+        log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")
+    worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"], default=None)
+    if worst and worst["snr"] > STRUCTURE:
+        log.warn(f"the residual image is not consistent with noise: smoothed to {worst['beams']:g} beams it reaches "
+                 f"{worst['snr']:.3g} sigma. Possible causes are calibration errors, emission outside the image, or emission "
+                 "that the model cannot represent")
+
+
+def _shortened(angle, digits):
+    """Return an angle as text, cut to so many decimal places."""
+    whole, point, decimals = angle.rpartition(".")
+    return whole + point + decimals[:digits] if digits else whole

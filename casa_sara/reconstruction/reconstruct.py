@@ -1,0 +1,359 @@
+"""From whitened visibilities to a model image: operators, bounds and solver put together, without CASA."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from casa_sara.data.distribution import Layout
+from casa_sara.data.visibilities import Visibilities
+from casa_sara.operators.dictionary import SaraDictionary
+from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
+from casa_sara.options import ImageGrid, SolverOptions
+from casa_sara.parallel.partition import ALONE, RankAssignment
+from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
+from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
+from casa_sara.reconstruction.state_file import digest
+from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
+from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve as solve_as_in_the_paper
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
+from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
+from casa_sara.solver.reweighting import Schedule, Stage, solve
+
+__all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
+
+STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
+NOISE_ONLY_SNR = 5.0
+NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
+DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
+
+
+@dataclass(frozen=True)
+class Control:
+    """How a solution is followed, ended and kept.
+
+    Attributes
+    ----------
+    progress : callable
+        Called after every iteration with (ppd, record): see :func:`casa_sara.solver.reweighting.solve`.
+    stopped : callable
+        Asked after every iteration; True ends the solution with what there is. It ends the NNLS fit too, and one
+        iteration follows.
+    checkpoint : Checkpoint, optional
+        Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
+        whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
+    """
+
+    progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
+    stopped: Callable[[], bool] = lambda: False
+    checkpoint: Checkpoint | None = None
+
+
+@dataclass
+class Reconstruction:
+    """A solved image.
+
+    Attributes
+    ----------
+    model : float32 (nx, ny)
+        Jy/pixel.
+    l2_bounds, residual_norms : float (d,)
+        ε_j and μ_j, whitened.
+    nnls_norms : float (d,)
+        μ_j of the NNLS image, from which adaptive bounds start.
+    record : SolverRecord
+    data_norm_sq : float
+        ‖U^½Φ‖², whitened, 1/Jy².
+    threshold : float
+        Last κ, Jy/pixel.
+    noise_jy_per_beam : float
+        Noise of the naturally weighted dirty image for the noise levels found.
+    kept : int (M',)
+        Samples that were used, numbers into the data given.
+    wild : list of dict
+        The others, named: see :class:`casa_sara.data.outliers.WildSamples`.
+    """
+
+    model: np.ndarray
+    l2_bounds: np.ndarray
+    residual_norms: np.ndarray
+    nnls_norms: np.ndarray
+    record: SolverRecord
+    data_norm_sq: float
+    threshold: float
+    noise_jy_per_beam: float
+    kept: np.ndarray
+    wild: list[dict]
+
+
+def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
+                control: Control = Control(), support: np.ndarray | None = None,
+                ranks: RankAssignment = ALONE) -> Reconstruction:
+    """Find the SARA image of block-sorted visibilities.
+
+    Parameters
+    ----------
+    samples : Samples
+        With the sampling density, and the noise where it is known.
+    grid : ImageGrid
+    options : SolverOptions
+    startmodel : real (nx, ny), optional
+        First image, Jy/pixel.
+    control : Control
+    support : bool (nx, ny), optional
+        The model is exactly 0 elsewhere.
+    ranks : RankAssignment
+        The ranks that share the work: `samples` are this rank's part, all else is the same on all.
+
+    Returns
+    -------
+    Reconstruction
+
+    Raises
+    ------
+    ValueError
+        Noise levels that are neither one for all blocks nor one for each.
+    CheckpointError
+        The state that was read is not one of these data.
+    """
+    comm, checkpoint = ranks.comm, control.checkpoint
+    check_l2bound(options, len(samples.offsets) - 1)
+    # images in units of the noise of one sample: every number is near 1
+    unit_jy = float(comm.mean(samples.data.weight, dtype=float) ** -0.5)
+    problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support, comm=comm,
+                         eps=operator_accuracy(samples.data, samples.offsets, samples.noise, comm))
+    layout = Layout(samples.offsets, comm)
+    if checkpoint is not None:
+        _identify(checkpoint, samples, layout, grid, support, comm)
+    if checkpoint is not None and comm.bcast(checkpoint.state is not None):
+        solution = _resume(samples, layout, problem_of, options, checkpoint, ranks)
+    else:
+        solution = _begin(samples, problem_of, options, startmodel, control.stopped, ranks)
+        if control.stopped():
+            control = replace(control, checkpoint=None)
+    record = _iterate(solution, options, control, layout, ranks)
+    return _result(solution, record, samples, comm)
+
+
+def _identify(checkpoint, samples, layout, grid, support, comm):
+    """Tell the checkpoint, on rank 0, of what data the solution is: digests of all that it depends on."""
+    data = samples.data
+    gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=samples.density)
+    digests = {name: digest(whole) for name, array in gathered.items()
+               if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
+    spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
+    digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
+        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex).items()}
+    comm.once(checkpoint.identify, **digests)
+
+
+def _iterate(solution, options, control, layout, ranks):
+    """Run Algorithm 2 to its end, keeping the state now and then; return the record."""
+    schedule = schedule_of(options)
+    if solution.found.noise_only:
+        schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
+    run = solve_as_in_the_paper if options.method == PAPER else solve
+    keep = partial(_keep, solution, control.checkpoint, layout, ranks)
+    return run(solution.ppd, solution.bounds, schedule, control.progress, control.stopped, keep, solution.stage)
+
+
+def _keep(solution, checkpoint, layout, ranks, stage, now):
+    """Write the checkpoint if there is one and its time has come, or `now`."""
+    if checkpoint is None:
+        return
+    comm, iteration = ranks.comm, solution.ppd.iteration
+    if comm.size == 1:
+        checkpoint.keep(lambda: solution.state(stage, layout, ranks), iteration, now)
+    elif comm.bcast_numbers([checkpoint.due(now)])[0]:  # then all ranks take part in gathering the state
+        state = solution.state(stage, layout, ranks)
+        comm.once(checkpoint.keep, lambda: state, iteration, now=True)
+
+
+def _result(solution, record, samples, comm):
+    """Return what was found, in Jy."""
+    found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
+    model = comm.own(ppd.model)
+    if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
+        record.stop_code = NOISE_ONLY
+    model *= np.float32(unit_jy)
+    return Reconstruction(
+        model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
+        data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
+        noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
+        wild=found.wild)
+
+
+@dataclass
+class _Solution:
+    """The iteration of a problem with its bounds, begun or gone on with."""
+
+    found: Findings
+    ppd: AdaptivePPD
+    bounds: AdaptiveBounds | GivenBounds | PaperBounds
+    stage: Stage | PaperStage | None = None
+
+    @classmethod
+    def of(cls, problem, found, options, ranks):
+        """Put it together, at the very beginning."""
+        measurement, samples = problem.measurement, problem.samples
+        dictionary = SaraDictionary(measurement.shape, ranks.wavelets(options.wavelets), options.wavelevels,
+                                    nthreads=options.nthreads, n_bases=len(options.wavelets))
+        if options.method == PAPER:
+            ppd = paper_iteration(problem, dictionary, found.data_norm_sq, options.positivity)
+        else:
+            ppd = AdaptivePPD(measurement, dictionary, problem.vis, samples.offsets, problem.precond,
+                              found.data_norm_sq, options.positivity, comm=ranks.comm)
+        ppd.unit_jy = problem.unit_jy
+        if problem.support is not None:
+            ppd.confine(problem.support)
+        weights = samples.data.weight * np.float32(problem.unit_jy**2)
+        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, samples.noise, options))
+
+    def state(self, stage, layout, ranks):
+        """Return, on rank 0, all that :func:`_resume` needs beside the data and the parameters, as one rank alone has it."""
+        left_out = np.concatenate(ranks.comm.allgather(layout.numbers(self.found.left_out)))
+        found = vars(self.found) | dict(left_out=np.sort(left_out))
+        ppd, kept = self.ppd.state(), Layout(self.ppd.offsets, ranks.comm)
+        ppd |= {name: kept.gather(ppd[name]) for name in SAMPLE_ARRAYS}
+        ppd |= {name: ranks.gather_bases(ppd[name]) for name in BASIS_ARRAYS}
+        return dict(found=found, ppd=ppd, bounds=self.bounds.state(), stage=stage.state())
+
+
+def _begin(samples, problem_of, options, startmodel, stopped, ranks):
+    """Leave out wild samples, and begin from the first image or from `startmodel`."""
+    problem, found, first = first_image(samples, problem_of, options, stopped, ranks.comm)
+    if startmodel is not None:
+        startmodel = startmodel / np.float32(problem.unit_jy)
+        if problem.support is not None:
+            startmodel *= problem.support
+    if options.method == PAPER:
+        found.nnls_norms = block_norms(problem, problem_of, options, stopped)
+        solution = _Solution.of(problem, found, options, ranks)
+        model = np.zeros_like(first) if startmodel is None else startmodel
+        threshold = first_threshold(options, first)
+    else:
+        solution = _Solution.of(problem, found, options, ranks)
+        found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
+        model = first if startmodel is None else startmodel
+        threshold = STEP_BALANCE * _mean_brightness(model)
+    solution.ppd.start_from(model)
+    solution.ppd.rescale(threshold)
+    return solution
+
+
+def _resume(samples, layout, problem_of, options, checkpoint, ranks):
+    """Go on from the state that rank 0 has read."""
+    with checkpoint.applied(ranks.comm.rank == 0) as state:
+        state = _plain_state(state, ranks.comm)
+        found = Findings(**{name: np.array(value) if isinstance(value, np.ndarray) else value
+                            for name, value in state["found"].items()})
+        found.left_out = layout.here(found.left_out)
+        problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq)
+        solution = _Solution.of(problem, found, options, ranks)
+        ppd, kept = state["ppd"], Layout(solution.ppd.offsets, ranks.comm)
+        ppd |= {name: kept.scatter(ppd[name]) for name in SAMPLE_ARRAYS}
+        ppd |= {name: ranks.scatter_bases(ppd[name]) for name in BASIS_ARRAYS}
+        solution.ppd.set_state(ppd)
+        solution.bounds.set_state(state["bounds"])
+        solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
+    return solution
+
+
+def check_l2bound(options: SolverOptions, blocks: int) -> None:
+    """Raise ValueError where the noise levels given are not one for all blocks, or one for each.
+
+    Parameters
+    ----------
+    options : SolverOptions
+    blocks : int
+        d.
+    """
+    if options.databound == "fixed" and len(options.l2bound) not in (1, blocks):
+        raise ValueError(f"l2bound = {list(options.l2bound)}: there are {blocks} blocks; give one noise level "
+                         "for all of them, or one for each")
+
+
+def _plain_state(state, comm):
+    """Return the state with all that every rank needs whole; what is spread over them stays on rank 0."""
+    if comm.size == 1:
+        return state
+    spread = {name: state["ppd"].pop(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)} if comm.rank == 0 else {}
+    state = comm.bcast(state)
+    return state | dict(ppd=state["ppd"] | {name: spread.get(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)})
+
+
+def operator_accuracy(data: Visibilities, offsets: np.ndarray, noise: np.ndarray | None,
+                      comm: Serial = SERIAL) -> float:
+    """What accuracy the operator needs for these data, by the noise measured in them; the best where that is unknown.
+
+    Parameters
+    ----------
+    data : Visibilities
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    noise : float (d,) or None
+        Noise of each block relative to the MS weights.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    float
+    """
+    if noise is None or not np.all(np.asarray(noise) > 0):
+        return SMALLEST_EPS[np.dtype(np.float32)]
+    level = np.repeat(np.asarray(noise, np.float32), np.diff(offsets))
+    return choose_eps(data.vis, data.weight / level**2, comm=comm)
+
+
+def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
+    """The solver's schedule for these task parameters.
+
+    Parameters
+    ----------
+    options : SolverOptions
+
+    Returns
+    -------
+    Schedule or PaperSchedule
+    """
+    if options.method == PAPER:
+        return PaperSchedule.of(options)
+    return Schedule(options.niter, options.nreweights, options.reweightdecay, options.reweighttol,
+                    options.reltol, options.finalreltol, significance=options.significance)
+
+
+def _bounds(ppd, nnls_norms, weights, noise, options):
+    samples = ppd.block_sizes
+    if options.method == PAPER:
+        return paper_bounds(ppd, nnls_norms, weights, options)
+    weight_sums = ppd.comm.block_sums(weights, ppd.offsets)
+    common = dict(samples=samples, weight_sums=weight_sums, n_bases=ppd.dictionary.n_bases, regscale=options.regscale)
+    if options.databound == "weights":
+        return GivenBounds(chi_square_bounds(samples), **common)
+    if options.databound == "fixed":
+        return GivenBounds(chi_square_bounds(samples, np.broadcast_to(options.l2bound, samples.shape)), **common)
+    # from what NNLS leaves, never below the noise that the data show
+    floor = ppd.residual_norms / DYNAMIC_RANGE
+    if noise is not None:
+        floor = np.fmax(floor, np.asarray(noise) * np.sqrt(2.0 * samples))
+    return AdaptiveBounds(nnls_norms, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
+                          step=options.boundstep, min_interval=options.boundinterval)
+
+
+def _is_noise_only(ppd, bounds):
+    """Whether the naturally weighted dirty image holds no peak above 5 times its noise."""
+    whitening = np.repeat(bounds.noise_weights.astype(np.float32), np.diff(ppd.offsets))
+    dirty = ppd.adjoint(ppd.vis * whitening)
+    return bool(np.abs(dirty).max() < NOISE_ONLY_SNR * np.sqrt(bounds.total_weight))
+
+
+def _mean_brightness(model):
+    """Mean brightness of the flux, Σx²/Σ|x|; 1 for an empty image."""
+    flux = np.abs(model).sum(dtype=float)
+    return float(np.square(model, dtype=float).sum() / flux) if flux > 0 else 1.0

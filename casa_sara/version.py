@@ -1,0 +1,3 @@
+"""The version of casa_sara."""
+
+__version__ = "0.1.0"
