@@ -26,7 +26,7 @@ from casa_sara.runtime.signals import stop_on_interrupt
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.record import CONVERGED, STOPPED_BY_USER, UNFEASIBLE
-from casa_sara.solver.reweighting import Schedule, Stage, solve
+from casa_sara.solver.reweighting import Schedule, Stage, run_algorithm_2
 
 HEADER = dict(version="1", parameters=dict(cell=[0.1, 0.1], niter=5), data={}, iteration=3, written=0.0)
 
@@ -225,7 +225,7 @@ def solved(problem, adaptive, path, interrupt_at):
             if now:
                 write(path, {}, dict(ppd=ppd.state(), bounds=bounds.state(), stage=stage.state()))
 
-        record = solve(ppd, bounds, schedule, stopped=lambda: ppd.iteration == last, keep=keep, stage=start)
+        record = run_algorithm_2(ppd, bounds, schedule, stopped=lambda: ppd.iteration == last, keep=keep, stage=start)
         assert record.stop_code == STOPPED_BY_USER if last else record.stop_code != STOPPED_BY_USER
         start = read(path)[1] if last else None
     return ppd.model, record

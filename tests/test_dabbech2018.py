@@ -23,7 +23,7 @@ from casa_sara.reconstruction.paper_method import block_norms
 from casa_sara.reconstruction.problem import Problem, Samples
 from casa_sara.reconstruction.reconstruct import Control, reconstruct, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve
+from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, run_paper_algorithm_2
 from casa_sara.solver.paperprior import RELAXATION, PaperPrior
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER
 
@@ -163,7 +163,7 @@ def solved(ppd, bounds, schedule, kappa, **more):
     def note(ppd, record):
         trace.append((ppd.iteration, record.reweighting[-1], ppd.model.ravel().copy(), bounds.l2_bounds.copy()))
 
-    return solve(ppd, bounds, schedule, note, **more), trace
+    return run_paper_algorithm_2(ppd, bounds, schedule, note, **more), trace
 
 
 def bounds_of(problem, start, **more):
@@ -237,7 +237,7 @@ def test_a_solution_goes_on_from_any_iteration():
         again, bounds = iteration(problem), bounds_of(problem, start)
         again.set_state(kept[0][0])
         bounds.set_state(kept[0][1])
-        record = solve(again, bounds, QUICK, stage=PaperStage.of(kept[0][2]))
+        record = run_paper_algorithm_2(again, bounds, QUICK, stage=PaperStage.of(kept[0][2]))
         assert again.iteration == last and record.resumed == [moment]
         np.testing.assert_array_equal(again.model.ravel(), wanted[-1][2])
 

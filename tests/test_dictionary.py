@@ -12,7 +12,7 @@ import pytest
 import pywt
 from scipy import ndimage
 
-from casa_sara.operators import _simd, _wavelet_kernels, _wavelet_lines
+from casa_sara.operators import _filter_bank, _vectors, _wavelet_kernels, _wavelet_lines
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.options import SARA_BASES
 
@@ -254,5 +254,5 @@ def test_bad_arrays():
 
 def test_cached_code_knows_its_source():
     """Numba's cache watches _wavelet_kernels.py only; SOURCE there makes it change together with the other files."""
-    digest = hashlib.sha256(b"".join(Path(module.__file__).read_bytes() for module in (_simd, _wavelet_lines)))
+    digest = hashlib.sha256(b"".join(Path(module.__file__).read_bytes() for module in (_vectors, _filter_bank, _wavelet_lines)))
     assert _wavelet_kernels.SOURCE == digest.hexdigest()[:12], f"set SOURCE = {digest.hexdigest()[:12]!r}"

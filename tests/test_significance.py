@@ -23,7 +23,7 @@ from casa_sara.solver.l2_bounds import GivenBounds
 from casa_sara.solver.matched_filter import MatchedFilter
 from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, STOPPED_BY_USER, STRUCTURED, SolverRecord
-from casa_sara.solver.reweighting import Schedule, Stage, solve
+from casa_sara.solver.reweighting import Schedule, Stage, run_algorithm_2
 from casa_sara.solver.significance import SignificantSupport, gradient_image, matched_filter
 from casa_sara.solver.unresolved import unresolved
 
@@ -780,11 +780,11 @@ def test_a_solution_has_the_weights_of_its_support(significance):
     ppd.l2_step = 1 / np.abs(sums.psf).sum()
     first_weights(ppd, bounds, significance > 0)
     first = ppd.l1_weights.copy()
-    solve(ppd, bounds, Schedule(niter=1, significance=significance))
+    run_algorithm_2(ppd, bounds, Schedule(niter=1, significance=significance))
     np.testing.assert_array_equal(ppd.l1_weights, first)
     sums, again, bounds = problem()
     again.vis[:], again.l2_step = ppd.vis, ppd.l2_step
-    solve(again, bounds, Schedule(niter=61, significance=significance))  # one iteration after the first of them
+    run_algorithm_2(again, bounds, Schedule(niter=61, significance=significance))  # one iteration after the first of them
     ratio = again.l1_weights[0, 24, 20] / again.l1_weights[0, 40, 5]
     assert (again.l1_weights[1:].min() < 0.13) == (significance > 0)
     assert (ratio < 0.26) == (significance > 0)

@@ -13,7 +13,7 @@ from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.nnls import nnls
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE
-from casa_sara.solver.reweighting import Schedule, _is_settled, solve
+from casa_sara.solver.reweighting import Schedule, _is_settled, run_algorithm_2
 
 
 def _ppd(problem, precond=None, threshold=0.2, **options):
@@ -183,7 +183,7 @@ def test_noise_levels_are_found_from_any_start(start):
     power = np.abs(problem.measurement.matrix[:, 0]) ** 2
     sums = np.add.reduceat(power, problem.offsets[:-1])
     bounds = AdaptiveBounds(start * np.sqrt(2.0 * samples), samples, sums, 3)
-    solve(_ppd(problem), bounds, Schedule(nreweights=8))
+    run_algorithm_2(_ppd(problem), bounds, Schedule(nreweights=8))
     np.testing.assert_allclose(bounds.noise, noise, rtol=0.1)
 
 
@@ -219,7 +219,7 @@ def test_reweighting_sharpens_and_every_update_is_recorded():
     def solution(nreweights):
         bounds = AdaptiveBounds(problem.errors, samples, sums, 3)
         ppd = _ppd(problem)
-        record = solve(ppd, bounds, Schedule(nreweights=nreweights, reweight_tol=1e-4))
+        record = run_algorithm_2(ppd, bounds, Schedule(nreweights=nreweights, reweight_tol=1e-4))
         return ppd.model, record
 
     plain, record = solution(0)
@@ -236,7 +236,7 @@ def test_bounds_that_no_image_meets_are_recognised():
     problem = Problem(seed=14, samples=(20, 30), noise=(1.0, 1.0))
     ppd = _ppd(problem)
     bounds = GivenBounds(0.01 * problem.errors, np.diff(problem.offsets), np.ones(2), 3)
-    assert solve(ppd, bounds, Schedule(nreweights=2)).stop_code == UNFEASIBLE
+    assert run_algorithm_2(ppd, bounds, Schedule(nreweights=2)).stop_code == UNFEASIBLE
 
 
 def test_divergence_is_recognised_and_the_last_good_image_kept():
@@ -245,7 +245,7 @@ def test_divergence_is_recognised_and_the_last_good_image_kept():
     ppd.start_from(problem.truth)
     bounds = AdaptiveBounds(problem.errors, np.diff(problem.offsets), np.ones(2), 3)
     ppd.l2_step *= 1e6  # far beyond what converges
-    assert solve(ppd, bounds, Schedule(nreweights=5, interval=5000)).stop_code == DIVERGED
+    assert run_algorithm_2(ppd, bounds, Schedule(nreweights=5, interval=5000)).stop_code == DIVERGED
     np.testing.assert_array_equal(ppd.model, problem.truth)
 
 
@@ -253,7 +253,7 @@ def test_given_bounds_are_met_at_the_end():
     problem = Problem(seed=15, samples=(20, 30), noise=(0.5, 0.5))
     ppd = _ppd(problem)
     bounds = GivenBounds(1.02 * problem.errors, np.diff(problem.offsets), np.ones(2), 3)
-    assert solve(ppd, bounds, Schedule(nreweights=2)).stop_code == CONVERGED
+    assert run_algorithm_2(ppd, bounds, Schedule(nreweights=2)).stop_code == CONVERGED
     residual = problem.vis - problem.measurement.forward(ppd.model)
     norms = np.array([np.linalg.norm(residual[a:b]) for a, b in ppd.blocks()])
     assert np.all(norms <= 1.01 * bounds.l2_bounds)
@@ -261,10 +261,10 @@ def test_given_bounds_are_met_at_the_end():
 
 def test_iteration_limit_and_stop_request():
     problem = Problem(seed=13)
-    record = solve(_ppd(problem), _given(problem, problem.errors), Schedule(niter=7))
+    record = run_algorithm_2(_ppd(problem), _given(problem, problem.errors), Schedule(niter=7))
     assert (record.stop_code, record.iteration[-1]) == (ITERATION_LIMIT, 7)
     ppd = _ppd(problem)
-    record = solve(ppd, _given(problem, problem.errors), stopped=lambda: ppd.iteration == 4)
+    record = run_algorithm_2(ppd, _given(problem, problem.errors), stopped=lambda: ppd.iteration == 4)
     assert (record.stop_code, record.iteration[-1]) == (STOPPED_BY_USER, 4)
 
 

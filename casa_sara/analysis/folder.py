@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from casa_sara.runtime.atomic import new_files
 
 __all__ = ["MEASURES", "PAGE", "in_the_way", "remove", "replaced"]
 
@@ -33,23 +33,15 @@ def replaced(folder: Path) -> Iterator[Path]:
     """
     made = not folder.exists()
     folder.mkdir(parents=True, exist_ok=True)
-    scratch = Path(tempfile.mkdtemp(prefix=".report.", dir=folder))
-    new, old = scratch / "new", scratch / "old"
     try:
-        new.mkdir()
-        yield new
-        names = sorted([*os.listdir(new), LIST])
-        (new / LIST).write_text("\n".join(names) + "\n", encoding="utf-8")
-        if taken := in_the_way(folder, names):
-            raise FileExistsError(f"'{folder}' holds {', '.join(taken)}, not of an earlier report: choose another "
-                                  "folder, or move it away")
-        old.mkdir()
-        for name in _own(folder):
-            os.replace(folder / name, old / name)
-        for name in names:
-            os.replace(new / name, folder / name)
+        with new_files(str(folder / "report"), lambda: [str(folder / name) for name in _own(folder)]) as new:
+            yield Path(new)
+            names = sorted([*os.listdir(new), LIST])
+            Path(new, LIST).write_text("\n".join(names) + "\n", encoding="utf-8")
+            if taken := in_the_way(folder, names):
+                raise FileExistsError(f"'{folder}' holds {', '.join(taken)}, not of an earlier report: choose another "
+                                      "folder, or move it away")
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)
         if made and not os.listdir(folder):
             folder.rmdir()
 

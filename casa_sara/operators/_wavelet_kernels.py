@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numba.extending import register_jitable
 
-from casa_sara.operators._simd import MAX_TAPS, VECTOR_BYTES
+from casa_sara.operators._filter_bank import MAX_TAPS
+from casa_sara.operators._vectors import VECTOR_BYTES
 from casa_sara.operators._wavelet_lines import (
     CLIP,
     CLIP_WEIGHTED,
@@ -38,7 +39,7 @@ MARGIN = MAX_TAPS // 2 - 1  # image lines needed before those of a chunk
 WINDOW_ROWS = 2 * CHUNK + MAX_TAPS
 ANALYSE_FINEST, ANALYSE_DEEPER, SYNTHESISE_DEEPER, BOTH_DEEPER, SYNTHESISE_FINEST = range(5)  # stages
 ZERO, ONE = np.int64(0), np.int64(1)  # literals would make Numba compile the callee for each
-SOURCE = "8544e03fc4d5"  # digest of _simd.py and _wavelet_lines.py: the cache of compiled code watches this file only
+SOURCE = "d71073de329e"  # digest of _vectors, _filter_bank and _wavelet_lines: the cache of compiled code watches this file only
 
 _inlined = jit.inner(error_model="numpy", fastmath={"contract"}, inline="always")
 

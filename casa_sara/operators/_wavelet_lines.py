@@ -15,11 +15,10 @@ from typing import NamedTuple
 
 from numba.extending import register_jitable
 
-from casa_sara.operators._simd import (
-    MAX_TAPS,
+from casa_sara.operators._filter_bank import MAX_TAPS, filter_bank
+from casa_sara.operators._vectors import (
     VECTOR_BYTES,
     evens,
-    filter_bank,
     lane_bytes,
     load,
     load_first,

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casa_sara.operators import kaiser_bessel
-from casa_sara.operators._gridding_vectors import load, multiply_add, store, zeros
+from casa_sara.operators._vectors import load_at, multiply_add, store_at, zeros
 from casa_sara.runtime import jit
 
 __all__ = ["AxisDecimation", "Separable", "decimate", "expand", "expand_rows", "scratch_shape", "separable"]
@@ -249,14 +249,14 @@ def _weigh_block(out, rows, column, taps, first, row_step, out_step, lanes):
     sum0 = sum1 = sum2 = sum3 = zeros(rows, lanes)
     tap = first
     for t in range(rows.size // length):
-        row = load(rows, t * length + column, lanes)
+        row = load_at(rows, t * length + column, lanes)
         sum0 = multiply_add(row, taps[tap].real, sum0)
         sum1 = multiply_add(row, taps[tap + out_step].real, sum1)
         sum2 = multiply_add(row, taps[tap + 2 * out_step].real, sum2)
         sum3 = multiply_add(row, taps[tap + 3 * out_step].real, sum3)
         tap += row_step
     for r in range(len(out)):
-        store(pixels, r * length + column, sum0)
+        store_at(pixels, r * length + column, sum0)
         sum0, sum1, sum2 = sum1, sum2, sum3
 
 
@@ -289,10 +289,10 @@ def _filter_phases(phases, columns, sums):
         for q in range(columns.factor):
             for a in range(-(-(n_taps - q) // columns.factor)):
                 tap = columns.taps[columns.margin + columns.factor * a + q]
-                pixels = load(flat, q * width + a + j, WIDE)
+                pixels = load_at(flat, q * width + a + j, WIDE)
                 real, imag = multiply_add(pixels, tap.real, real), multiply_add(pixels, tap.imag, imag)
-        store(both, j, real)
-        store(both, width + j, imag)
+        store_at(both, j, real)
+        store_at(both, width + j, imag)
 
 
 @_inlined
@@ -305,6 +305,6 @@ def _spread_phases(sums, columns, phases, shifts):
             total = zeros(flat, WIDE)
             for a in range(-(-(n_taps - q) // columns.factor)):
                 tap = columns.taps[columns.margin + columns.factor * a + q]
-                total = multiply_add(load(both, shifts + k - a, WIDE), tap.real, total)
-                total = multiply_add(load(both, width + shifts + k - a, WIDE), tap.imag, total)
-            store(flat, q * width + k, total)
+                total = multiply_add(load_at(both, shifts + k - a, WIDE), tap.real, total)
+                total = multiply_add(load_at(both, width + shifts + k - a, WIDE), tap.imag, total)
+            store_at(flat, q * width + k, total)

@@ -27,7 +27,6 @@ import scipy.fft
 from casa_sara.operators import kaiser_bessel
 from casa_sara.operators._gridding_vectors import (
     gather_rows,
-    multiply,
     pair_sums,
     polynomials,
     scale_pairs,
@@ -272,7 +271,7 @@ def _interpolate(cells, stride, points, kernel, values, worker, workers):
     for p in range(points.order.size * worker // workers, points.order.size * (worker + 1) // workers):
         down = polynomials(kernel.coefs, points.within[p, 0], points.within[p, 1], kernel.terms, kernel.lanes)
         along = second_half_twice(down)
-        real, imag = pair_sums(multiply(gather_rows(cells, points.first[p], stride, down, kernel.width), along))
+        real, imag = pair_sums(gather_rows(cells, points.first[p], stride, down, kernel.width) * along)
         values[points.order[p], 0] = points.scales[p, 0] * real
         values[points.order[p], 1] = points.scales[p, 1] * imag
 

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from casa_sara.reconstruction.state_file import NEW, CheckpointError, digest, read, write
+from casa_sara.reconstruction.state_file import CheckpointError, digest, read, write
+from casa_sara.runtime.atomic import NEW
 
 __all__ = ["Checkpoint"]
 

@@ -20,10 +20,10 @@ from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_thre
 from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
 from casa_sara.reconstruction.state_file import digest
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
-from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, solve as solve_as_in_the_paper
+from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, run_paper_algorithm_2
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
-from casa_sara.solver.reweighting import Schedule, Stage, solve
+from casa_sara.solver.reweighting import Schedule, Stage, run_algorithm_2
 
 __all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
 
@@ -40,7 +40,7 @@ class Control:
     Attributes
     ----------
     progress : callable
-        Called after every iteration with (ppd, record): see :func:`casa_sara.solver.reweighting.solve`.
+        Called after every iteration with (ppd, record): see :func:`casa_sara.solver.reweighting.run_algorithm_2`.
     stopped : callable
         Asked after every iteration; True ends the solution with what there is. It ends the NNLS fit too, and one
         iteration follows.
@@ -157,7 +157,7 @@ def _iterate(solution, options, control, layout, ranks):
     schedule = schedule_of(options)
     if solution.found.noise_only:
         schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
-    run = solve_as_in_the_paper if options.method == PAPER else solve
+    run = run_paper_algorithm_2 if options.method == PAPER else run_algorithm_2
     keep = partial(_keep, solution, control.checkpoint, layout, ranks)
     return run(solution.ppd, solution.bounds, schedule, control.progress, control.stopped, keep, solution.stage)
 

@@ -18,11 +18,12 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["CheckpointError", "NEW", "digest", "read", "write"]
+from casa_sara.runtime.atomic import new_file
+
+__all__ = ["CheckpointError", "digest", "read", "write"]
 
 MAGIC = b"casa_sara checkpoint 1\n"  # the number is that of the format
 TYPES = ("<f4", "<f8", "<c8", "<c16", "<i4", "<i8", "|b1")
-NEW = ".new"  # ends the name of a file that is not complete yet
 _DIGEST = hashlib.sha256().digest_size
 
 
@@ -52,23 +53,10 @@ def write(path: str, header: dict[str, Any], state: dict[str, Any]) -> None:
               for name, array in arrays.items()]
     text = json.dumps(header | dict(state=tree, arrays=listed), default=lambda value: value.tolist()).encode()
     begin = MAGIC + struct.pack("<Q", len(text)) + text
-    try:
-        with open(path + NEW, "wb") as file:
-            file.write(begin + hashlib.sha256(begin).digest())
-            for array in arrays.values():
-                file.write(_bytes(array))
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(path + NEW, path)
-    except BaseException:
-        if os.path.lexists(path + NEW):
-            os.unlink(path + NEW)
-        raise
-    folder = os.open(os.path.dirname(path) or ".", os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with new_file(path) as file:
+        file.write(begin + hashlib.sha256(begin).digest())
+        for array in arrays.values():
+            file.write(_bytes(array))
 
 
 def read(path: str) -> tuple[dict[str, Any], dict[str, Any]]:

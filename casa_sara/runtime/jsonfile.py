@@ -5,8 +5,9 @@ from __future__ import annotations
 import json
 import math
 import os
-import tempfile
 from typing import Any
+
+from casa_sara.runtime.atomic import new_file
 
 __all__ = ["load", "plain", "save"]
 
@@ -24,19 +25,9 @@ def plain(value: Any) -> Any:
 
 def save(path: str | os.PathLike, value: Any) -> None:
     """Write `value` to a new file, which takes its place when it is complete."""
-    folder, base = os.path.split(os.fspath(path))
-    handle, scratch = tempfile.mkstemp(prefix=f".{base}.", dir=folder or ".")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            json.dump(_spelled(plain(value)), file, allow_nan=False, indent=1)
-            file.write("\n")
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(scratch, 0o666 & ~umask)  # mkstemp keeps it from everybody else
-        os.replace(scratch, path)
-    except BaseException:
-        os.unlink(scratch)
-        raise
+    text = json.dumps(_spelled(plain(value)), allow_nan=False, indent=1) + "\n"
+    with new_file(path) as file:
+        file.write(text.encode())
 
 
 def load(path: str | os.PathLike) -> Any:

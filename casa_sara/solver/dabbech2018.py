@@ -16,7 +16,7 @@ from casa_sara.options import SolverOptions
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, SolverRecord
 
-__all__ = ["PaperBounds", "PaperSchedule", "PaperStage", "solve"]
+__all__ = ["PaperBounds", "PaperSchedule", "PaperStage", "run_paper_algorithm_2"]
 
 USUAL = 250  # iterations of one weighted problem, for forecasts
 
@@ -212,7 +212,7 @@ class PaperStage:
         return stage
 
 
-def solve(ppd: AdaptivePPD, bounds: PaperBounds, schedule: PaperSchedule = PaperSchedule(),
+def run_paper_algorithm_2(ppd: AdaptivePPD, bounds: PaperBounds, schedule: PaperSchedule = PaperSchedule(),
           progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None,
           stopped: Callable[[], bool] = lambda: False,
           keep: Callable[[PaperStage, bool], None] = lambda stage, now: None,
@@ -226,7 +226,7 @@ def solve(ppd: AdaptivePPD, bounds: PaperBounds, schedule: PaperSchedule = Paper
     bounds : PaperBounds
     schedule : PaperSchedule
     progress, stopped, keep, stage
-        As of :func:`casa_sara.solver.reweighting.solve`.
+        As of :func:`casa_sara.solver.reweighting.run_algorithm_2`.
 
     Returns
     -------
@@ -239,7 +239,7 @@ def solve(ppd: AdaptivePPD, bounds: PaperBounds, schedule: PaperSchedule = Paper
     ppd.dictionary.norm, record = stage.norm, stage.record
     while True:
         stage.last = stage.last or stage.k >= schedule.reweightings
-        record.stop_code = _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep)
+        record.stop_code = _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep)
         if stage.last or record.stop_code != CONVERGED:
             break
         _renew_weights(ppd, schedule, stage)
@@ -248,7 +248,7 @@ def solve(ppd: AdaptivePPD, bounds: PaperBounds, schedule: PaperSchedule = Paper
     return record
 
 
-def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
+def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
     """Algorithm 1 for one set of weights; return its stop code."""
     tolerance, record = schedule.final_reltol if stage.last else schedule.reltol, stage.record
     while True:

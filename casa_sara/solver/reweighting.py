@@ -24,7 +24,7 @@ from casa_sara.solver.record import (
 )
 from casa_sara.solver.significance import SignificantSupport
 
-__all__ = ["Schedule", "Stage", "solve"]
+__all__ = ["Schedule", "Stage", "run_algorithm_2"]
 
 RISE = 1.05  # of the residual norm within one interval, from its least
 STEADY = 3e-3  # relative change of the residual norm within one interval
@@ -132,7 +132,7 @@ class Stage:
         return stage
 
 
-def solve(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, schedule: Schedule = Schedule(),
+def run_algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, schedule: Schedule = Schedule(),
           progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None,
           stopped: Callable[[], bool] = lambda: False, keep: Callable[[Stage, bool], None] = lambda stage, now: None,
           stage: Stage | None = None) -> SolverRecord:
@@ -168,7 +168,7 @@ def solve(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, schedule: Sche
     while True:
         if stage.k >= schedule.nreweights and not stage.last:
             _begin_last(ppd, bounds, stage)
-        record.stop_code = _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep)
+        record.stop_code = _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep)
         if stage.last or record.stop_code != CONVERGED:
             break
         if _renew_weights(ppd, bounds, schedule, stage):
@@ -197,7 +197,7 @@ def _begin_last(ppd, bounds, stage):
     stage.last, stage.start, stage.settled = True, ppd.iteration, 0
 
 
-def _solve_one(ppd, bounds, schedule, stage, progress, stopped, keep):
+def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
     """Algorithm 1 for one set of weights; return its stop code."""
     tolerance = schedule.final_reltol if stage.last else schedule.reltol
     record = stage.record

@@ -1,11 +1,7 @@
 """What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
 (.mask .image.pbcor .model.pbcor), and the record .sara.json.
 
-They appear together. They are written in `.<name>.new`, beside their places; when all are complete and on the disk, the
-folder is renamed `.<name>.whole`, and from then on they are the products: the older ones go to `.<name>.old`, the
-folder becomes `.<name>.moving`, its contents go to their places, and `.<name>.old` is removed. A run that is killed
-leaves one of these folders, and the next one under this name goes by it: `.new` is thrown away, `.whole` and `.moving`
-are followed to the end. No name of another run can give one of these folders.
+They appear together (:mod:`casa_sara.runtime.atomic`), and replace those of an older run of this name together.
 """
 
 from __future__ import annotations
@@ -24,13 +20,12 @@ from casa_sara.casa.images.restore import restore, write_corrected
 from casa_sara.casa.runtime.child_process import ChildError, in_child
 from casa_sara.casa.runtime.tools import opened
 from casa_sara.runtime import jsonfile
-from casa_sara.runtime.signals import signals_deferred
+from casa_sara.runtime.atomic import new_files, recover_files, sync
 from casa_sara.version import __version__
 
 __all__ = [
     "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
-    "recover_products",
-    "remove_products", "write_products",
+    "recover_products", "remove_products", "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
@@ -79,63 +74,26 @@ def _bytes_needed(shape, more=0):
     return ((len(PRODUCTS) + more) * 4 + 3 + more) * math.prod(shape) + 2_000_000
 
 
-def _folder_of(imagename, stage):
-    """Return the folder of one stage: '.new', '.whole', '.moving' or '.old'."""
-    folder, base = os.path.split(imagename)
-    return os.path.join(folder, f".{base}{stage}")
-
-
 @contextmanager
 def new_products(imagename):
     """Yield the name under which to write the products; they take their places when all are complete.
 
     Those of an older run are replaced, all together; when something fails, everything stays as it was. The folder
-    of the report, where others may have put files, is left to who writes reports.
+    of the report, where others may have put files, is left to who writes reports. No name of another run can give one of the
+    folders in which products wait (:mod:`casa_sara.runtime.atomic`).
     """
-    recover_products(imagename)
-    new = _folder_of(imagename, ".new")
-    os.mkdir(new)
-    try:
+    with new_files(imagename, lambda: _older(imagename)) as new:
         yield os.path.join(new, os.path.basename(imagename))
-    except BaseException:
-        shutil.rmtree(new, ignore_errors=True)
-        raise
-    with signals_deferred():
-        os.rename(new, _folder_of(imagename, ".whole"))
-        _take_places(imagename)
 
 
 def recover_products(imagename):
     """Complete or remove the products of a run of this name that was killed while it wrote them."""
-    shutil.rmtree(_folder_of(imagename, ".new"), ignore_errors=True)
-    _take_places(imagename)
+    recover_files(imagename, lambda: _older(imagename))
 
 
-def _take_places(imagename):
-    """Replace the products by those in '.whole', or continue an interrupted replacement."""
-    whole, moving, old = (_folder_of(imagename, stage) for stage in (".whole", ".moving", ".old"))
-    if os.path.isdir(whole):  # what stands under the name is older
-        os.makedirs(old, exist_ok=True)
-        for path in existing_products(imagename):
-            if not path.endswith(REPORT):
-                os.rename(path, os.path.join(old, os.path.basename(path)))
-        os.rename(whole, moving)
-    if os.path.isdir(moving):
-        for name in os.listdir(moving):
-            os.rename(os.path.join(moving, name), os.path.join(os.path.dirname(imagename), name))
-        os.rmdir(moving)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _sync(folder):
-    """Bring files and folders to the disk, so that a power failure does not undo the order of events."""
-    for parent, _, names in os.walk(folder):
-        for path in [parent, *(os.path.join(parent, name) for name in names)]:
-            handle = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
+def _older(imagename):
+    """Return the paths of the products that new ones replace."""
+    return [path for path in existing_products(imagename) if not path.endswith(REPORT)]
 
 
 def write_products(output, plane, images, sumwt, beam, record=None, child=None):
@@ -170,7 +128,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
                      beam=beam, restoringbeam=output.restoringbeam, history=output.history, pbcor=output.pbcor)
             if record is not None:
                 jsonfile.save(root + RECORD, record)
-            _sync(os.path.dirname(root))
+            sync(os.path.dirname(root))
         except (ChildError, OSError) as error:
             raise _not_written(output.imagename, _bytes_needed(plane.pb.shape, more), os.path.dirname(root), error) from error
 
