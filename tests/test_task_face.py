@@ -16,9 +16,9 @@ import pytest
 from casa_sara import tsara
 from casa_sara.options import SolverOptions
 from casa_sara.private.validation import Parameter, validate
-from casa_sara.tasks.tsara import PARAMETERS
+from casa_sara.private.parameters import TSARA
 
-BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+BY_NAME = {parameter.name: parameter for parameter in TSARA}
 GOOD = {"vis": "data.ms", "imagename": "try", "cell": "0.1arcsec"}
 
 # Where tsara's parameters differ from tclean's of the same name, and why.
@@ -117,7 +117,7 @@ def test_help_tells_every_parameter():
     documentation = inspect.getdoc(tsara)
     for section in ("Parameters\n----------\n", "Returns\n-------\n", "Examples\n--------\n"):
         assert section in documentation
-    for parameter in PARAMETERS:
+    for parameter in TSARA:
         assert f"\n{parameter.name} : " in documentation
     assert tsara._info_group_ == "imaging" and tsara._info_desc_
 
@@ -163,7 +163,7 @@ def tclean_params():
 def our_params():
     """Return tsara's parameters in the same form."""
     params = {}
-    for p in PARAMETERS:
+    for p in TSARA:
         ends = {"min": p.minimum, "max": p.maximum}
         relation = "equals" if p.open_on else "notequals"
         params[p.name] = {
@@ -307,7 +307,7 @@ def closing_and_opening(parameter):
 
 
 @pytest.mark.parametrize(
-    "parameter", [p for p in PARAMETERS if p.opener and closing_and_opening(p)[0] and len(p.allowed) != 1],
+    "parameter", [p for p in TSARA if p.opener and closing_and_opening(p)[0] and len(p.allowed) != 1],
     ids=lambda p: p.name,
 )
 def test_sub_parameter_that_would_be_ignored_is_refused(received, parameter):
