@@ -137,7 +137,8 @@ def main(iterations, runs):
     print(f"| {done} iterations | {per_step / 1024:.1f} kB per 1000 iterations, {files} more open files |")
     print(f"| {runs} runs in one session | {session / 1024:.1f} kB per run, {files_session} more open files, "
           f"results {'the same' if same else 'DIFFER'} |")
-    print(f"| 3 runs at once in threads, 3 in an event loop, 1 inside it | results {'the same' if threads else 'DIFFER'} |")
+    print(f"| 3 runs at once in threads, 3 in an event loop, 1 inside it | results "
+          f"{'the same' if threads else 'DIFFER'} |")
     print(f"| 1, 2, 3 and 4 threads | largest difference {difference:.1e} of the brightest pixel |")
 
 

@@ -81,7 +81,8 @@ def attempt(name, folder):
     if run.returncode < 0:
         return f"the Python session dies of signal {-run.returncode}"
     results = [line for line in run.stdout.splitlines() if line.startswith("RESULT ")]
-    errors = [line for line in run.stderr.splitlines() if "Error" in line or "\tSEVERE\t" in line and "TAI_UTC" not in line]
+    errors = [line
+              for line in run.stderr.splitlines() if "Error" in line or "\tSEVERE\t" in line and "TAI_UTC" not in line]
     return results[-1].removeprefix("RESULT ") if results else "error: " + (errors or ["?"])[-1][:160]
 
 

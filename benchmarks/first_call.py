@@ -2,10 +2,11 @@
 
     python benchmarks/first_call.py [--repeat 3] [--folder FOLDER]
 
-Images 64² pixels of the demo's smallest simulation, in a fresh process each time: with no compiled code on the disk, with
-what the first call left there, and `import casa_sara` alone. Wall-clock time, and processor time of the process and those
-that it starts; the least of `--repeat` runs, as other work on the machine only adds. The parts are of the fastest second
-call; they overlap where threads and the writing process work beside the rest, so that only wall-clock time is told.
+Images 64² pixels of the demo's smallest simulation, in a fresh process each time: with no compiled code on the disk,
+with what the first call left there, and `import casa_sara` alone. Wall-clock time, and processor time of the process
+and those that it starts; the least of `--repeat` runs, as other work on the machine only adds. The parts are of the
+fastest second call; they overlap where threads and the writing process work beside the rest, so that only wall-clock
+time is told.
 """
 
 from __future__ import annotations
@@ -43,7 +44,8 @@ def timed(name, label):
     setattr(continuum, name, replacement)
 
 for name, label in (("forecast_run", "look at the data, forecast"), ("_read", "read, primary beam"),
-                    ("_point_spread", "weights, PSF, beam; twice"), ("solve_image", "solve"), ("write_products", "write")):
+                    ("_point_spread", "weights, PSF, beam; twice"), ("solve_image", "solve"),
+                    ("write_products", "write")):
     timed(name, label)
 tsara(vis=sys.argv[1], imagename="image", datacolumn="data", imsize=64, cell="0.2arcsec", overwrite=True)
 parts["all"] = time.perf_counter() - start
@@ -100,7 +102,8 @@ def main():
             print(f"  {label:<28}{seconds:8.2f}")
     # waiting for the compiled code, what stands between the parts, the end of the process
     rest = wall - nothing - sum(seconds for label, seconds in parts.items() if label != "all")
-    print(f"  {'the rest':<28}{rest:8.2f}\n  {'all':<28}{wall:8.2f}, of which the fixed cost {wall - parts['solve']:.2f}")
+    print(f"  {'the rest':<28}{rest:8.2f}\n  {'all':<28}{wall:8.2f}, of which the fixed cost "
+          f"{wall - parts['solve']:.2f}")
 
 
 if __name__ == "__main__":

@@ -2,9 +2,10 @@
 
     python benchmarks/forecast.py [FOLDER] [--all]
 
-Simulates MeasurementSets of 1e5 and 1e6 visibilities in FOLDER (default: a temporary one) and images each in a process of
-its own with 256², 1024² and 2048² pixels, through the re-weightings that need most; --all adds 4096 × 2048 pixels with two
-million visibilities in 22 blocks. The peak is VmHWM of the process; the forecast is what the run says before it reads.
+Simulates MeasurementSets of 1e5 and 1e6 visibilities in FOLDER (default: a temporary one) and images each in a process
+of its own with 256², 1024² and 2048² pixels, through the re-weightings that need most; --all adds 4096 × 2048 pixels
+with two million visibilities in 22 blocks. The peak is VmHWM of the process; the forecast is what the run says before
+it reads.
 """
 
 import json
@@ -46,8 +47,8 @@ def main(folder, runs):
             _simulate(vis, *SETS[name])
         ran, dry = (_last_line([str(vis), str(nx), str(ny), *more]) for more in ((), ("dry",)))
         held, said, peak = (ran[key] / 1e6 for key in ("held", "said", "peak"))
-        print(f"| {nx} × {ny} | {ran['visibilities']} | {held:.0f} MB | {said:.0f} MB | {peak:.0f} MB | {said / peak:.2f} "
-              f"| {dry['seconds']['total']:.0f} s | {ran['seconds']:.0f} s |", flush=True)
+        print(f"| {nx} × {ny} | {ran['visibilities']} | {held:.0f} MB | {said:.0f} MB | {peak:.0f} MB | "
+              f"{said / peak:.2f} | {dry['seconds']['total']:.0f} s | {ran['seconds']:.0f} s |", flush=True)
 
 
 def _simulate(vis, scans, seconds):

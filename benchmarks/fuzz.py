@@ -2,15 +2,17 @@
 
     python benchmarks/fuzz.py [--tables main subtables] [--mode mfs] [--verbose] [WORDS]
 
-spoils a small MeasurementSet in every way of `TABLES` whose name holds WORDS (a cell empty, of another shape or type, not a
-number, an identifier out of range, a column gone, …) and runs tsara on it. Many cases share one process, which says what it
-begins; when it dies or hangs, that case is counted and another process goes on after it. Right outcomes are
+spoils a small MeasurementSet in every way of `TABLES` whose name holds WORDS (a cell empty, of another shape or type,
+not a number, an identifier out of range, a column gone, …) and runs tsara on it. Many cases share one process, which
+says what it begins; when it dies or hangs, that case is counted and another process goes on after it. Right outcomes
+are
 
     as untouched    the image of the MeasurementSet as it was: what was spoiled does not matter
     without rows    the image of it with the spoiled rows flagged
     clear error     an error that names vis (or datacolumn) and the spoiled column or subtable, not in CASA's words
 
-and wrong ones "wrong image", "bare error", "changed" (the MeasurementSet is not the same afterwards), "signal" and "hang".
+and wrong ones "wrong image", "bare error", "changed" (the MeasurementSet is not the same afterwards), "signal" and
+"hang".
 """
 
 from __future__ import annotations
@@ -62,23 +64,28 @@ def main_cases():
     }.items():  # fmt: skip
         for rows, which in (([0], "first row"), ([ROW], "one row"), (None, "all rows")):
             for manager in ("StandardStMan", "TiledShapeStMan"):
-                cases |= {f"{col} {shape} in {which}, {manager}": shaped(col, rows, shape, manager=manager) for shape in shapes}
+                cases |= {f"{col} {shape} in {which}, {manager}": shaped(col, rows, shape, manager=manager)
+                          for shape in shapes}
                 cases[f"{col} undefined in {which}, {manager}"] = undefined(col, rows, manager=manager)
         cases[f"{col} empty in one row"] = cells(col, [ROW], lambda cell: cell[..., :0])
-        cases[f"{col} {shapes[0]} of fixed shape"] = shaped(col, None, shapes[0], manager="TiledColumnStMan", shape=shapes[0])
+        cases[f"{col} {shapes[0]} of fixed shape"] = shaped(col, None, shapes[0], manager="TiledColumnStMan",
+                                                            shape=shapes[0])
         cases[f"{col} with an axis more"] = cells(col, None, lambda cell: cell[None], ndim=len(shapes[0]) + 1)
     for col in ("DATA", "WEIGHT", "SIGMA", "WEIGHT_SPECTRUM", "UVW"):
         cases |= {f"{col} {value} in one row": put(col, (..., ROW), value) for value in (np.nan, np.inf, -np.inf)}
     for col, kinds in {
         "DATA": ("dcomplex", "float", "double", "int"), "FLAG": ("int", "uchar", "float"),
-        "WEIGHT": ("double", "int", "complex"), "SIGMA": ("double", "int"), "WEIGHT_SPECTRUM": ("double", "int", "complex"),
+        "WEIGHT": ("double", "int", "complex"), "SIGMA": ("double", "int"),
+        "WEIGHT_SPECTRUM": ("double", "int", "complex"),
         "UVW": ("float", "int"), "TIME": ("float", "string"), "INTERVAL": ("float", "int"), "EXPOSURE": ("float",),
         "FLAG_ROW": ("int",), "TIME_CENTROID": ("float",),
-        **dict.fromkeys(("ANTENNA1", "ANTENNA2", "FIELD_ID", "DATA_DESC_ID", "SCAN_NUMBER", "OBSERVATION_ID", "STATE_ID"),
+        **dict.fromkeys(("ANTENNA1", "ANTENNA2", "FIELD_ID", "DATA_DESC_ID", "SCAN_NUMBER", "OBSERVATION_ID",
+                         "STATE_ID"),
                         ("short", "double", "string")),
     }.items():  # fmt: skip
         cases |= {f"{col} of type {kind}": remake(col, _as_type(kind), valueType=kind) for kind in kinds}
-    for col in ("ANTENNA1", "ANTENNA2", "FIELD_ID", "DATA_DESC_ID", "SCAN_NUMBER", "OBSERVATION_ID", "STATE_ID", "ARRAY_ID",
+    for col in ("ANTENNA1", "ANTENNA2", "FIELD_ID", "DATA_DESC_ID", "SCAN_NUMBER", "OBSERVATION_ID", "STATE_ID",
+                "ARRAY_ID",
                 "FEED1", "FEED2", "PROCESSOR_ID"):
         for value in (-1, -2, 99, 2**31 - 1, -(2**31)):
             cases[f"{col} {value} in one row"] = put(col, ROW, value)
@@ -96,10 +103,13 @@ def main_cases():
     return cases
 
 
-MAIN_COLUMNS = ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "CORRECTED_DATA", "DATA", "DATA_DESC_ID", "EXPOSURE", "FEED1", "FEED2",
-                "FIELD_ID", "FLAG", "FLAG_CATEGORY", "FLAG_ROW", "INTERVAL", "MODEL_DATA", "OBSERVATION_ID", "PROCESSOR_ID",
+MAIN_COLUMNS = ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "CORRECTED_DATA", "DATA", "DATA_DESC_ID", "EXPOSURE", "FEED1",
+                "FEED2",
+                "FIELD_ID", "FLAG", "FLAG_CATEGORY", "FLAG_ROW", "INTERVAL", "MODEL_DATA", "OBSERVATION_ID",
+                "PROCESSOR_ID",
                 "SCAN_NUMBER", "SIGMA", "STATE_ID", "TIME", "TIME_CENTROID", "UVW", "WEIGHT", "WEIGHT_SPECTRUM")
-_TYPES = {"short": np.int16, "int": np.int32, "uchar": np.uint8, "float": np.float32, "double": float, "complex": complex,
+_TYPES = {"short": np.int16, "int": np.int32, "uchar": np.uint8, "float": np.float32, "double": float,
+          "complex": complex,
           "dcomplex": complex, "string": str}
 
 
@@ -115,7 +125,8 @@ def _as_type(kind):
 
 TEXTS = {
     "ANTENNA": "MOUNT NAME STATION TYPE", "FIELD": "CODE NAME", "FLAG_CMD": "COMMAND REASON TYPE",
-    "HISTORY": "APPLICATION MESSAGE ORIGIN", "OBSERVATION": "OBSERVER PROJECT SCHEDULE_TYPE TELESCOPE_NAME", "POINTING": "NAME",
+    "HISTORY": "APPLICATION MESSAGE ORIGIN", "OBSERVATION": "OBSERVER PROJECT SCHEDULE_TYPE TELESCOPE_NAME",
+    "POINTING": "NAME",
     "PROCESSOR": "SUB_TYPE TYPE", "SOURCE": "CODE NAME", "SPECTRAL_WINDOW": "FREQ_GROUP_NAME NAME", "STATE": "OBS_MODE",
 }
 INTEGERS = {
@@ -137,7 +148,8 @@ ARRAYS = {
     "SOURCE": "DIRECTION PROPER_MOTION REST_FREQUENCY SYSVEL",
     "SPECTRAL_WINDOW": "CHAN_FREQ CHAN_WIDTH EFFECTIVE_BW RESOLUTION",
 }
-REQUIRED = ("ANTENNA", "DATA_DESCRIPTION", "FEED", "FIELD", "FLAG_CMD", "HISTORY", "OBSERVATION", "POINTING", "POLARIZATION",
+REQUIRED = ("ANTENNA", "DATA_DESCRIPTION", "FEED", "FIELD", "FLAG_CMD", "HISTORY", "OBSERVATION", "POINTING",
+            "POLARIZATION",
             "PROCESSOR", "SPECTRAL_WINDOW", "STATE")
 UNUSED = "unused row"
 
@@ -149,12 +161,14 @@ def subtable_cases():
         every = [cells for kind in (TEXTS, INTEGERS, NUMBERS, ARRAYS) for cells in kind.get(table, "").split()]
         cases |= {f"{table} gone": lambda name, table=table: shutil.rmtree(f"{name}/{table}"),
                   f"{table} without rows": rows_of(table, lambda tb: tb.removerows(list(range(tb.nrows())))),
-                  f"{table} without its last row": rows_of(table, lambda tb: tb.nrows() and tb.removerows([tb.nrows() - 1])),
+                  f"{table} without its last row": rows_of(table, lambda tb: tb.nrows()
+                                                           and tb.removerows([tb.nrows() - 1])),
                   f"{table} with an empty row, an {UNUSED}": rows_of(table, lambda tb: tb.addrows(1))}
         cases |= {f"{table}/{col} gone": within(table, lacking(col)) for col in every}
         cases |= {f"{table}/{col} of type {kind}": within(table, remake(col, _as_type(kind), valueType=kind))
-                  for cols, kind in ((INTEGERS, "double"), (INTEGERS, "string"), (NUMBERS, "float"), (NUMBERS, "string"),
-                                     (ARRAYS, "float"), (ARRAYS, "string")) for col in cols.get(table, "").split()}
+                  for cols, kind in ((INTEGERS, "double"), (INTEGERS, "string"), (NUMBERS, "float"),
+                                     (NUMBERS, "string"), (ARRAYS, "float"), (ARRAYS, "string"))
+                  for col in cols.get(table, "").split()}
         cases |= {f"{table}/{col} of type int": within(table, remake(col, lambda old: [0] * len(old), valueType="int"))
                   for col in TEXTS.get(table, "").split()}
         for where in ("first row", UNUSED):
@@ -172,8 +186,10 @@ def ways(table, col, unused):
     elif col in NUMBERS.get(table, "").split():
         changes = {f"{value}": value for value in (np.nan, np.inf, -1.0, 0.0, 1e300)}
     else:
-        changes = {"undefined": lambda cell: None, "of no size": lambda cell: cell[..., :0], "zero": lambda cell: cell * 0,
-                   "longer": lambda cell: np.concatenate([cell, cell], axis=-1), "negative": lambda cell: -abs(cell) - 1,
+        changes = {"undefined": lambda cell: None, "of no size": lambda cell: cell[..., :0],
+                   "zero": lambda cell: cell * 0,
+                   "longer": lambda cell: np.concatenate([cell, cell], axis=-1),
+                   "negative": lambda cell: -abs(cell) - 1,
                    "of an axis more": lambda cell: cell[None],
                    "NaN": lambda cell: cell * 0 - 1 if cell.dtype.kind == "i" else cell * np.nan}
     for words, change in changes.items():
@@ -230,10 +246,12 @@ TABLES = {"main": main_cases, "subtables": subtable_cases}
 
 
 def image(name, mode):
-    """Return what is compared of the images of a MeasurementSet: the residual, or of a dry run the number of samples."""
+    """Return what is compared of the images of a MeasurementSet: the residual,
+    or of a dry run the number of samples."""
     from casa_sara import tsara
 
-    result = tsara(vis=name, imagename="out", overwrite=True, nthreads=1, wavelets=["dirac", "db1"], **GRID | MODES[mode])
+    result = tsara(vis=name, imagename="out", overwrite=True, nthreads=1, wavelets=["dirac", "db1"],
+                   **GRID | MODES[mode])
     if MODES[mode].get("dryrun"):
         return np.array([result["forecast"]["visibilities"]], float)
     if MODES[mode].get("savemodel"):
@@ -257,7 +275,8 @@ def attempt(spoil, mode, references, words):
     if mode != "modelcolumn" and hashes("spoiled.ms", "table.lock") != before:
         return "changed", said
     if made is None:
-        named = any(word in said for word in ("vis = ", "vis: ", "datacolumn = ")) and any(word in said for word in words)
+        named = any(word in said for word in ("vis = ", "vis: ", "datacolumn = ")) and any(word in said
+                                                                                           for word in words)
         return "clear error" if named and "cannot be read" not in said else "bare error", said
     off = {outcome: np.abs(made - one).max() / np.abs(one).max() for outcome, one in references.items()
            if one.shape == made.shape}
@@ -313,7 +332,8 @@ def run(table, mode, words, folder):
     while done < count:
         errors = Path(folder, "errors.txt")
         with open(errors, "wb") as file:
-            process = subprocess.Popen([sys.executable, os.path.abspath(__file__), words, "--tables", table, "--mode", mode,
+            process = subprocess.Popen([sys.executable, os.path.abspath(__file__), words, "--tables", table, "--mode",
+                                        mode,
                                         "--work", str(done)], cwd=folder, stdout=subprocess.PIPE, stderr=file)
         begun, hung = None, False
         for line in lines_of(process):
@@ -355,7 +375,8 @@ def main():
                 counts[outcome] += 1
                 if given.verbose or outcome not in GOOD:
                     print(f"{name}: {outcome} {said}", flush=True)
-            print(f"{table}, {given.mode}: " + ", ".join(f"{outcome} {count}" for outcome, count in counts.most_common()))
+            print(f"{table}, {given.mode}: "
+                  + ", ".join(f"{outcome} {count}" for outcome, count in counts.most_common()))
 
 
 if __name__ == "__main__":

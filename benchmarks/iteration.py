@@ -2,16 +2,16 @@
 
     python benchmarks/iteration.py [--cases 0 1 2 …] [--repeat 15] [--pfb]
 
-The iteration is that of the task: single precision, Dirac and Db1–Db8 on four levels, weights, over-relaxation, all blocks
-through one operator. "PyWavelets + finufft" is the same algorithm (the same class, in double precision) on wavedec2 and
-waverec2, the bases shared out to threads, and on finufft with its defaults, one transform for all blocks. Medians (quartiles);
-both take turns. The floor: bytes that have to be moved (image-sized and visibility-sized arrays, coefficients and weights, grid)
-over the copy bandwidth measured in the same run, or the multiplications and additions of the wavelet filters over the peak rate,
-whichever is more. With --pfb the analysis and synthesis of pfb-imaging's dictionary (from PyPI) are timed too, in double
-precision as it has them.
+The iteration is that of the task: single precision, Dirac and Db1–Db8 on four levels, weights, over-relaxation, all
+blocks through one operator. "PyWavelets + finufft" is the same algorithm (the same class, in double precision) on
+wavedec2 and waverec2, the bases shared out to threads, and on finufft with its defaults, one transform for all blocks.
+Medians (quartiles); both take turns. The floor: bytes that have to be moved (image-sized and visibility-sized arrays,
+coefficients and weights, grid) over the copy bandwidth measured in the same run, or the multiplications and additions
+of the wavelet filters over the peak rate, whichever is more. With --pfb the analysis and synthesis of pfb-imaging's
+dictionary (from PyPI) are timed too, in double precision as it has them.
 
-Memory is that of a process with casatools loaded, above what it takes before, at its peak through operators and iterations; growth
-is what is added from the 10th iteration to the last.
+Memory is that of a process with casatools loaded, above what it takes before, at its peak through operators and
+iterations; growth is what is added from the 10th iteration to the last.
 """
 
 from __future__ import annotations
@@ -84,7 +84,8 @@ def ours(case):
     """The iteration as the task has it."""
     uv, cell, image, offsets = visibilities(case)
     shape, nthreads = image.shape, case[4]
-    return solver(MeasurementOperator(uv, cell, shape, nthreads=nthreads), SaraDictionary(shape, nthreads=nthreads), image,
+    return solver(MeasurementOperator(uv, cell, shape, nthreads=nthreads), SaraDictionary(shape, nthreads=nthreads),
+                  image,
                   offsets)
 
 
@@ -99,10 +100,12 @@ def floor_seconds(ppd, nthreads, repeat):
     """Least time for the bytes and for the filters' arithmetic of one iteration."""
     pixels, samples = ppd.model.size, ppd.vis.size
     moved = 3 * 4 * ppd.dictionary.n_coefs  # dual read and written, weights read
-    moved += 4 * pixels * (3 * 2 + 4 + 3)  # x, z, x̄ read and written; gradients and lower bound; images of the operators
+    # x, z, x̄ read and written; gradients and lower bound; images of the operators
+    moved += 4 * pixels * (3 * 2 + 4 + 3)
     moved += 2 * ppd.measurement._nufft.grid.nbytes
     moved += samples * (8 * (2 + 4 + 1) + 4 + 2 * 28)  # Φx̄, Φz, v, y; U; places, scales, order of both ways
-    return max(moved / bandwidth(nthreads, repeat), filter_flops(ppd.model.shape, ppd.dictionary.wavelets) / peak(nthreads, repeat))
+    return max(moved / bandwidth(nthreads, repeat),
+               filter_flops(ppd.model.shape, ppd.dictionary.wavelets) / peak(nthreads, repeat))
 
 
 def time_case(case, repeat, slow_repeat):
@@ -118,16 +121,18 @@ def time_case(case, repeat, slow_repeat):
         times["step"].append(seconds(ppd.step))
         times["forward"].append(seconds(ppd.measurement.forward, ppd.model_bar, ppd._phi_bar))
         times["adjoint"].append(seconds(ppd.measurement.adjoint, ppd.l2_dual, ppd._data_gradient))
-        times["dictionary"].append(seconds(ppd.dictionary.dual_step, ppd.model_bar, ppd.l1_dual, THRESHOLD, ppd.l1_weights,
+        times["dictionary"].append(seconds(ppd.dictionary.dual_step, ppd.model_bar, ppd.l1_dual, THRESHOLD,
+                                           ppd.l1_weights,
                                            ppd._prior_gradient, RELAXATION))
         if turn < slow_repeat:
             times["reference"].append(seconds(slow.step))
     middle = {name: np.median(found) for name, found in times.items()}
     floor = floor_seconds(ppd, nthreads, repeat)
     parts = " + ".join(f"{1e3 * middle[name]:.1f}" for name in ("forward", "adjoint", "dictionary"))
-    print(f"| {nx}×{ny} | {ppd.vis.size:.3g} in {blocks} | {nthreads} | {spread(times['step'])} | {1 / middle['step']:.1f} | {parts} "
-          f"| {spread(times['reference'])} | {middle['reference'] / middle['step']:.0f} | {1e3 * floor:.1f} "
-          f"| {middle['step'] / floor:.1f} |", flush=True)
+    print(f"| {nx}×{ny} | {ppd.vis.size:.3g} in {blocks} | {nthreads} | {spread(times['step'])} | "
+          f"{1 / middle['step']:.1f} | {parts} | {spread(times['reference'])} | "
+          f"{middle['reference'] / middle['step']:.0f} | {1e3 * floor:.1f} | {middle['step'] / floor:.1f} |",
+              flush=True)
 
 
 def measure_memory(case, iterations):
@@ -170,8 +175,10 @@ print(np.median(times[1:]))
 
 
 def compare_with_pfb(cases, repeat):
-    """Print how long pfb-imaging's dictionary takes for analysis and synthesis, and ours for those and the dual update."""
-    print("\n| size | threads | this prior step, ms | pfb-imaging's analysis + synthesis, ms | ratio |\n" + "|---" * 5 + "|")
+    """Print how long pfb-imaging's dictionary takes for analysis and synthesis,
+    and ours for those and the dual update."""
+    print("\n| size | threads | this prior step, ms | pfb-imaging's analysis + synthesis, ms | ratio |\n" + "|---" * 5
+          + "|")
     for nx, ny, nthreads in sorted({(*case[:2], case[4]) for case in cases}):
         command = [sys.executable, "-c", PFB, *map(str, (nx, ny, nthreads, repeat))]
         theirs = float(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()[-1])
@@ -185,11 +192,14 @@ def compare_with_pfb(cases, repeat):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--cases", type=int, nargs="+", default=list(range(len(CASES))), help="numbers of the table's lines")
+    parser.add_argument("--cases", type=int, nargs="+", default=list(range(len(CASES))),
+                        help="numbers of the table's lines")
     parser.add_argument("--repeat", type=int, default=15)
     parser.add_argument("--slow-repeat", type=int, default=3, help="repetitions of PyWavelets and finufft")
-    parser.add_argument("--pfb", action="store_true", help="time pfb-imaging's dictionary too, which has to be installed")
-    parser.add_argument("--memory", type=int, metavar="CASE", help="only measure the memory of this case, in this process")
+    parser.add_argument("--pfb", action="store_true",
+                        help="time pfb-imaging's dictionary too, which has to be installed")
+    parser.add_argument("--memory", type=int, metavar="CASE",
+                        help="only measure the memory of this case, in this process")
     parser.add_argument("--iterations", type=int, default=1000, help="for the growth of the memory")
     options = parser.parse_args()
     if options.memory is not None:
@@ -203,10 +213,12 @@ def main():
         time_case(case, options.repeat, options.slow_repeat)
     if options.pfb:
         compare_with_pfb(cases, options.slow_repeat)
-    print("\n| image | visibilities, blocks | casatools, MB | more at the peak, MB | iterations | growth, MB |\n" + "|---" * 6 + "|",
+    print("\n| image | visibilities, blocks | casatools, MB | more at the peak, MB | iterations | growth, MB |\n"
+          + "|---" * 6 + "|",
           flush=True)
     for number in options.cases:
-        subprocess.run([sys.executable, __file__, "--memory", str(number), "--iterations", str(options.iterations)], check=True)
+        subprocess.run([sys.executable, __file__, "--memory", str(number), "--iterations", str(options.iterations)],
+                       check=True)
 
 
 if __name__ == "__main__":

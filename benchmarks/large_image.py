@@ -1,11 +1,13 @@
-"""An image of the size of the paper's, from MeasurementSets to images and report: 4096×2048 pixels, 2 million visibilities, 22 blocks.
+"""An image of the size of the paper's, from MeasurementSets to images and report: 4096×2048 pixels,
+2 million visibilities, 22 blocks.
 
     python benchmarks/large_image.py FOLDER [--clean NITER]
 
-The demo's radio galaxy at Cygnus A's own size and flux density (190 Jy over two arcminutes) in X band, configurations A–D in the
-ratio of the paper's integration times; pixels of 0.04 arcsec, 2.5 times the nominal resolution; input SNR 35 dB, gain errors of 1 %.
-`tsara` runs with defaults and `report=True` on two threads. With --clean, tclean multiscale (Briggs −1) runs to at most NITER
-iterations after it.
+The demo's radio galaxy at Cygnus A's own size and flux density (190 Jy over two arcminutes) in X band, configurations
+A–D in the ratio of the paper's integration times; pixels of 0.04 arcsec, 2.5 times the nominal resolution; input SNR 35
+dB, gain errors of 1 %.
+`tsara` runs with defaults and `report=True` on two threads. With --clean, tclean multiscale (Briggs −1) runs to at most
+NITER iterations after it.
 """
 
 from __future__ import annotations
@@ -41,8 +43,9 @@ def report_line(name, model, truth, seconds, beam, more=""):
     from casa_sara.analysis.metrics import smooth, snr
 
     half = [0.5 * axis / CELL for axis in beam[:2]]
-    print(f"| {name} | {seconds:.0f} | {more} | {snr(truth, model):.1f} | {snr(smooth(truth, half, beam[2]), smooth(model, half, beam[2])):.1f} "
-          f"| {model.sum():.2f} ({truth.sum():.2f}) |", flush=True)
+    print(f"| {name} | {seconds:.0f} | {more} | {snr(truth, model):.1f} | "
+          f"{snr(smooth(truth, half, beam[2]), smooth(model, half, beam[2])):.1f} | {model.sum():.2f} "
+          f"({truth.sum():.2f}) |", flush=True)
 
 
 def main():
@@ -80,7 +83,8 @@ def main():
             from casatasks import tclean
 
             begin = time.perf_counter()
-            done = tclean(**common, imagename=str(base / "tclean"), deconvolver="multiscale", scales=scales, smallscalebias=-0.8,
+            done = tclean(**common, imagename=str(base / "tclean"), deconvolver="multiscale", scales=scales,
+                          smallscalebias=-0.8,
                           niter=options.clean, gain=0.2, nsigma=2.0)
             seconds = time.perf_counter() - begin
         report_line("tclean multiscale", read_image(base / "tclean.model")[0], truth, seconds, beam, done["iterdone"])

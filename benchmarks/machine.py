@@ -1,4 +1,5 @@
-"""What this machine can do, measured in the run that it is compared with: name, bandwidth, peak rate, memory of a process."""
+"""What this machine can do, measured in the run that it is compared with: name, bandwidth, peak rate,
+memory of a process."""
 
 from __future__ import annotations
 

@@ -2,9 +2,10 @@
 
     python benchmarks/methods.py FOLDER [--niter 20000] [--cases NAME ...]
 
-Scenes of quality.py at an input SNR of 35 dB (their first observation each) and the sets of real_data.py, each solved by both
-methods with defaults, but for `niter`, on one thread, two cases at a time. SNRs are those of the model smoothed to half of and to the
-whole beam, as in schedule.py; σ is the standard deviation of the naturally weighted residual image.
+Scenes of quality.py at an input SNR of 35 dB (their first observation each) and the sets of real_data.py, each solved
+by both methods with defaults, but for `niter`, on one thread, two cases at a time. SNRs are those of the model smoothed
+to half of and to the whole beam, as in schedule.py; σ is the standard deviation of the naturally weighted residual
+image.
 """
 
 from __future__ import annotations
@@ -80,7 +81,8 @@ def row(name, base, niter):
             fwhm = 2 * [factor * 2 * WIDTH * Case(name).super_resolution] if simulated else None
             cells.append(f"{snr(smoothed_truth(sky, fwhm), smooth(found.model, fwhm, 0.0)):.1f}" if simulated else "")
         noise = found.l2_bounds / np.sqrt(2.0 * np.diff(part.offsets))
-        cells += [f"{found.model.sum(dtype=float):.4g}", f"{residual_sigma(part.data, grid, found.model, found.kept):.3g}",
+        cells += [f"{found.model.sum(dtype=float):.4g}",
+                  f"{residual_sigma(part.data, grid, found.model, found.kept):.3g}",
                   f"{np.median(noise):.3g} ({np.nanmedian(part.noise):.3g})", f"{found.record.iteration[-1]}",
                   f"{seconds:.0f}", found.record.stop_description]
         lines.append("| " + " | ".join(cells) + " |")
@@ -96,7 +98,8 @@ def main():
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     head = ("data", "method", "SNR at half a beam", "at one beam", "flux Jy", "σ residual", "noise found (measured)",
             "iterations", "s", "stop")
-    print(f"{machine()}, at most {options.niter} iterations\n\n| {' | '.join(head)} |\n" + "|---" * len(head) + "|", flush=True)
+    print(f"{machine()}, at most {options.niter} iterations\n\n| {' | '.join(head)} |\n" + "|---" * len(head) + "|",
+          flush=True)
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         for lines in pool.map(partial(row, base=options.folder.resolve(), niter=options.niter), options.cases):
             print(lines, flush=True)

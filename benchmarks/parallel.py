@@ -1,11 +1,12 @@
-"""One iteration on ranks of an MPI job: 1 rank × 2 threads beside 2 ranks × 1 thread and more, memory of each rank, the sum.
+"""One iteration on ranks of an MPI job: 1 rank × 2 threads beside 2 ranks × 1 thread and more, memory of each rank,
+the sum.
 
     python benchmarks/parallel.py [--cases 0 1 …] [--repeat 15] [--rounds 3] [--costs]
 
-The iteration is that of the task, on the same arrays, shared as the task shares them.  Every layout is an MPI job of its own; the
-jobs take turns for some rounds, so that a ratio compares what ran at the same time.  Times are medians over iterations of the
-slowest rank; "sum" is that of the image's gradient over the ranks alone.  Memory is what a rank holds, above what it holds before:
-its own, and its share of what the ranks of a machine have in common.  The model is
+The iteration is that of the task, on the same arrays, shared as the task shares them.  Every layout is an MPI job of
+its own; the jobs take turns for some rounds, so that a ratio compares what ran at the same time.  Times are medians
+over iterations of the slowest rank; "sum" is that of the image's gradient over the ranks alone.  Memory is what a rank
+holds, above what it holds before: its own, and its share of what the ranks of a machine have in common.  The model is
 
     t = max over ranks of (operator on those that have visibilities + their visibilities + their bases) + sum
 
@@ -80,8 +81,10 @@ def _seconds(comm, call):
 
 def job(case, ranks, nthreads, repeat):
     """Run an MPI job and return what it found."""
-    environment = dict(os.environ, OMPI_ALLOW_RUN_AS_ROOT="1", OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1", OMP_NUM_THREADS=str(nthreads))
-    found = subprocess.run(["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), sys.executable, __file__, "--rank",
+    environment = dict(os.environ, OMPI_ALLOW_RUN_AS_ROOT="1", OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1",
+                       OMP_NUM_THREADS=str(nthreads))
+    found = subprocess.run(["mpirun", "--oversubscribe", "--bind-to", "none", "-n", str(ranks), sys.executable,
+                            __file__, "--rank",
                             json.dumps([case, nthreads, repeat])], env=environment, capture_output=True, text=True)
     lines = [line for line in found.stdout.split("\n") if line.startswith('{"seconds"')]
     if not lines:
@@ -97,7 +100,8 @@ def modelled(case, found, ranks):
     bases = basis_costs(SARA_BASES, case[:2])
     owners = np.array(found["owners"] or [0] * len(bases))
     readers = [rank * found["readers"] % ranks < found["readers"] for rank in range(ranks)]
-    return max(reads * (fixed + shared / found["readers"]) + bases[owners == rank].sum() for rank, reads in enumerate(readers))
+    return max(reads * (fixed + shared / found["readers"]) + bases[owners == rank].sum()
+               for rank, reads in enumerate(readers))
 
 
 def compare(case, repeat, rounds):
@@ -108,14 +112,17 @@ def compare(case, repeat, rounds):
             found[layout].append(job(case, *layout, repeat))
     reference = [one["seconds"] for one in found[LAYOUTS[0]]]
     print(f"\n{case[0]} x {case[1]}, {case[2]:.0e} visibilities")
-    print("| ranks x threads | s/iteration | ratio to 1 x 2 | sum, s | model, 1 thread, s | with visibilities | MB of each rank |")
+    print("| ranks x threads | s/iteration | ratio to 1 x 2 | sum, s | model, 1 thread, s | with visibilities | MB of "
+          "each rank |")
     print("|---|---|---|---|---|---|---|")
     for (ranks, nthreads), every in found.items():
         ratios = sorted(one["seconds"] / base for one, base in zip(every, reference))
         last = every[-1]
-        print(f"| {ranks} x {nthreads} | {statistics.median(one['seconds'] for one in every):.3f} | {statistics.median(ratios):.2f} "
-              f"({ratios[0]:.2f}–{ratios[-1]:.2f}) | {statistics.median(one['sum'] for one in every):.4f} | "
-              f"{modelled(case, last, ranks):.3f} | {last['readers']} | {', '.join(map(str, last['memory_mb']))} |", flush=True)
+        print(f"| {ranks} x {nthreads} | {statistics.median(one['seconds'] for one in every):.3f} | "
+              f"{statistics.median(ratios):.2f} ({ratios[0]:.2f}–{ratios[-1]:.2f}) | "
+              f"{statistics.median(one['sum'] for one in every):.4f} | {modelled(case, last, ranks):.3f} | "
+              f"{last['readers']} | {', '.join(map(str, last['memory_mb']))} |",
+              flush=True)
 
 
 def costs():

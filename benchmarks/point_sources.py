@@ -1,13 +1,15 @@
-"""Unresolved sources on and between pixels: what becomes of them, on scenes enough to tell a change of the solver from chance.
+"""Unresolved sources on and between pixels: what becomes of them,
+on scenes enough to tell a change of the solver from chance.
 
     python benchmarks/point_sources.py FOLDER [--against BEFORE.json]
 
-The samples are those of observations of quality.py (made in FOLDER where they are not there); their visibilities are the exact
-sums of point sources and Gaussians at random places, with thermal noise and, in some scenes, gain errors of every antenna and block. The
-solution is that of the task with defaults on one thread, two scenes at a time. SNRs are those of the model, smoothed to half
-of and to the whole beam, against the same Gaussians without pixels. A single scene goes up and down by a decibel or two with
-anything that changes; the means count. "First" scenes were looked at while the release from positivity was chosen, the "kept
-apart" ones only for the last choice. Results are written to FOLDER/point_sources.json.
+The samples are those of observations of quality.py (made in FOLDER where they are not there); their visibilities are
+the exact sums of point sources and Gaussians at random places, with thermal noise and, in some scenes, gain errors of
+every antenna and block. The solution is that of the task with defaults on one thread, two scenes at a time. SNRs are
+those of the model, smoothed to half of and to the whole beam, against the same Gaussians without pixels. A single scene
+goes up and down by a decibel or two with anything that changes; the means count. "First" scenes were looked at while
+the release from positivity was chosen, the "kept apart" ones only for the last choice. Results are written to
+FOLDER/point_sources.json.
 """
 
 from __future__ import annotations
@@ -77,7 +79,8 @@ FIRST = (
 )  # fmt: skip
 KEPT_APART = (
     *(replace(scene, seed=900 + number) for number, scene in enumerate(FIRST)),
-    Scene("sixty", 60, 30, 40, 909, gain_rms=0.01), Scene("twenty and extended", 20, 20, 40, 910, extended=True, gain_rms=0.02),
+    Scene("sixty", 60, 30, 40, 909, gain_rms=0.01),
+    Scene("twenty and extended", 20, 20, 40, 910, extended=True, gain_rms=0.02),
     Scene("five", 5, 100, 45, 911, gain_rms=0.005), Scene("one", 1, 1, 40, 912, samples_of=Case("M31", array="VLA A")),
     Scene("sixty", 60, 30, 40, 913, samples_of=Case("3c353", super_resolution=2.5)),
     Scene("twenty and extended", 20, 20, 40, 914, extended=True, samples_of=Case("3c353", super_resolution=4.0)),
@@ -139,7 +142,8 @@ def main():
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     base = options.folder.resolve()
     before = json.loads(options.against.read_text()) if options.against else {}
-    print(f"{machine()}\n\n| scene | iterations | negative pixels | at half a beam | at one beam |\n" + "|---" * 5 + "|")
+    print(f"{machine()}\n\n| scene | iterations | negative pixels | at half a beam | at one beam |\n" + "|---" * 5
+          + "|")
     results = {}
     # the observations first, so that no two processes make the same one
     for case in {scene.samples_of: None for scene in FIRST + KEPT_APART}:
@@ -150,7 +154,8 @@ def main():
                 results[f"{title}: {scene.label}"] = result
                 row(f"{title}: {scene.label}", result, before.get(f"{title}: {scene.label}"))
             names = [name for name in results if name.startswith(title)]
-            mean = {key: np.mean([results[name][key] for name in names]) for key in ("iterations", "negative", "half", "one")}
+            mean = {key: np.mean([results[name][key] for name in names])
+                    for key in ("iterations", "negative", "half", "one")}
             earlier = {key: np.mean([before[name][key] for name in names]) for key in mean} if before else None
             row(f"**{title}: means**", mean, earlier)
     (base / "point_sources.json").write_text(json.dumps(results))
@@ -158,8 +163,10 @@ def main():
 
 def row(label, now, before):
     """Print a line of the table."""
-    counts = [f"{now[key]:.0f}" if before is None else f"{before[key]:.0f} → {now[key]:.0f}" for key in ("iterations", "negative")]
-    snrs = [f"{now[key]:.2f}" + ("" if before is None else f" ({now[key] - before[key]:+.2f})") for key in ("half", "one")]
+    counts = [f"{now[key]:.0f}" if before is None else f"{before[key]:.0f} → {now[key]:.0f}"
+              for key in ("iterations", "negative")]
+    snrs = [f"{now[key]:.2f}" + ("" if before is None else f" ({now[key] - before[key]:+.2f})")
+            for key in ("half", "one")]
     print("| " + " | ".join([label, *counts, *snrs]) + " |", flush=True)
 
 

@@ -12,8 +12,9 @@ tclean multiscale runs with Briggs −1 and natural weights. On the first case o
 settings in GRID is tried; the best against the truth, at half the beam, serves all cases of that scene and array
 (arrays other than the first, that of M31). `asp` runs on the first case of every scene. All run on one thread.
 
-SNR = 20 log10(‖truth‖/‖truth − model‖) of models, raw and smoothed to a half and to one restoring beam of the CLEAN that
-tsara is compared with. The table compares with the harder of the two, where tsara's margin at half a beam is smaller.
+SNR = 20 log10(‖truth‖/‖truth − model‖) of models, raw and smoothed to a half and to one restoring beam of the CLEAN
+that tsara is compared with. The table compares with the harder of the two, where tsara's margin at half a beam is
+smaller.
 """
 
 from __future__ import annotations
@@ -209,7 +210,8 @@ def run_tsara(case: Case, folder: Path, against: dict[str, dict], suffix="", **o
 
 
 def compare_with_longer(cases: list[Case], base: Path) -> None:
-    """Print SNRs with defaults and with ten times the interval and the iterations, at half of Briggs' beam and at one."""
+    """Print SNRs with defaults and with ten times the interval and the iterations,
+    at half of Briggs' beam and at one."""
     from unittest import mock
 
     from casa_sara.solver.reweighting import Schedule
@@ -221,7 +223,8 @@ def compare_with_longer(cases: list[Case], base: Path) -> None:
         usual = json.loads((folder / "tsara.json").read_text())["at"]["briggs"]
         with mock.patch("casa_sara.reconstruction.reconstruct.schedule_of", lambda options: patient):
             longer = run_tsara(case, folder, found, "_longer")["at"]["briggs"]
-        print(f"| {case.label} | " + " | ".join(f"{of[beam]:.1f}" for beam in ("0.5", "1.0") for of in (usual, longer)) + " |",
+        print(f"| {case.label} | " + " | ".join(f"{of[beam]:.1f}" for beam in ("0.5", "1.0") for of in (usual, longer))
+              + " |",
               flush=True)
 
 
@@ -238,8 +241,10 @@ def row(case: Case, base: Path):
     asp = [json.loads(path.read_text())["0.5"] for path in folder.glob("asp_*.json")]
     cells = [case.label, f"{better['weighting']}, {better['setting']}"]
     cells += [f"{at[key]:.1f} / {better[key]:.1f}" for key in ("raw", "log", "0.5", "1.0")]
-    cells += [f"{margins['0.5']:+.1f}", f"{margin[other['weighting']]['0.5']:+.1f}", f"{max(asp):.1f}" if asp else "", f"{at['flux']:.4f} / {better['flux']:.4f}",
-              f"{sara['residual'] / clean['briggs']['residual']:.2f}", f"{sara['dr']:.0f} / {clean['briggs']['dr']:.0f}",
+    cells += [f"{margins['0.5']:+.1f}", f"{margin[other['weighting']]['0.5']:+.1f}", f"{max(asp):.1f}" if asp
+              else "", f"{at['flux']:.4f} / {better['flux']:.4f}",
+              f"{sara['residual'] / clean['briggs']['residual']:.2f}",
+              f"{sara['dr']:.0f} / {clean['briggs']['dr']:.0f}",
               "{:.2f}–{:.2f}".format(*sara["bounds"]),
               f"{sara['seconds']:.0f} / {better['seconds']:.0f}", f"{sara['iterations']} {sara['stop']}"]
     return "| " + " | ".join(cells) + " |", margins
@@ -248,7 +253,8 @@ def row(case: Case, base: Path):
 def print_table(base: Path, grid: list[Case]) -> None:
     """Print the study and its summary."""
     head = ("case", "harder CLEAN", "SNR", "log SNR", "at half beam", "at one beam", "margin at half beam",
-            "margin over the other", "asp at half beam", "flux", "residual ratio", "DR", "bounds / true", "s", "iterations")
+            "margin over the other", "asp at half beam", "flux", "residual ratio", "DR", "bounds / true", "s",
+            "iterations")
     print("| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
     half, one, moderate, fluxes = [], [], [], []
     for case in grid:
@@ -260,9 +266,10 @@ def print_table(base: Path, grid: list[Case]) -> None:
             fluxes.append(case.label)
         if 30 <= case.noise_db <= 40:
             moderate.append(margins["0.5"])
-    print(f"\n{len(grid)} cases. Margin at half a beam: least {min(half):.1f}, median {np.median(half):.1f} dB (at 30–40 dB input: "
-          f"{np.median(moderate):.1f}); at one beam, over either CLEAN: least {min(one):.1f}, median {np.median(one):.1f} dB. "
-          f"Total flux off by more than 1 % where a CLEAN's is not: {'; '.join(fluxes) or 'none'}.")
+    print(f"\n{len(grid)} cases. Margin at half a beam: least {min(half):.1f}, median {np.median(half):.1f} dB (at "
+          f"30–40 dB input: {np.median(moderate):.1f}); at one beam, over either CLEAN: least {min(one):.1f}, median "
+          f"{np.median(one):.1f} dB. Total flux off by more than 1 % where a CLEAN's is not: "
+          f"{'; '.join(fluxes) or 'none'}.")
 
 
 def main():
@@ -270,7 +277,8 @@ def main():
     parser.add_argument("folder", type=Path)
     parser.add_argument("--only", choices=("clean", "tsara", "table", "longer"))
     parser.add_argument("--cases", default="", help="only cases whose label holds this")
-    parser.add_argument("--oversampling", type=int, default=3, help="pixels of the sky in one of the image; 1: the image's own")
+    parser.add_argument("--oversampling", type=int, default=3,
+                        help="pixels of the sky in one of the image; 1: the image's own")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     base = options.folder.resolve()

@@ -2,10 +2,10 @@
 
     python benchmarks/scaling.py FOLDER [--picture scaling.png] [--only visibilities]
 
-One sky of 256² pixels (unresolved sources on extended emission) is observed by the VLA in four configurations. Images of 256² to
-4096² pixels are made of 10⁵ visibilities; images of 1024² of 10⁴ to 10⁷. Every run is `tsara` with defaults on two threads in a
-process of its own, from MeasurementSets to images; memory is that of the process above what CASA takes before. The exponent is
-that of a power law between one line and the next.
+One sky of 256² pixels (unresolved sources on extended emission) is observed by the VLA in four configurations. Images
+of 256² to 4096² pixels are made of 10⁵ visibilities; images of 1024² of 10⁴ to 10⁷. Every run is `tsara` with defaults
+on two threads in a process of its own, from MeasurementSets to images; memory is that of the process above what CASA
+takes before. The exponent is that of a power law between one line and the next.
 """
 
 from __future__ import annotations
@@ -62,7 +62,8 @@ def run(folder, vis, pixels):
 
 def series(title, sizes, runs):
     """Print one table; `sizes` is what grows."""
-    print(f"\n| {title} | visibilities | s | exponent | iterations | ms per iteration, all told | memory, MB | exponent |\n"
+    print(f"\n| {title} | visibilities | s | exponent | iterations | ms per iteration, all told | memory, MB | "
+          "exponent |\n"
           + "|---" * 8 + "|", flush=True)
     done = []
     for size, made in zip(sizes, runs):
@@ -71,8 +72,8 @@ def series(title, sizes, runs):
         if done:
             growth = np.log(size / done[-1][0])
             steps = [f"{np.log(made[key] / done[-1][1][key]) / growth:.2f}" for key in ("each", "memory")]
-        print(f"| {size:.3g} | {made['visibilities']:.3g} | {made['seconds']:.1f} | {steps[0]} | {made['iterations']} {made['stop']} "
-              f"| {made['each']:.0f} | {made['memory']:.0f} | {steps[1]} |", flush=True)
+        print(f"| {size:.3g} | {made['visibilities']:.3g} | {made['seconds']:.1f} | {steps[0]} | {made['iterations']} "
+              f"{made['stop']} | {made['each']:.0f} | {made['memory']:.0f} | {steps[1]} |", flush=True)
         done.append((size, made))
     return done
 
@@ -87,7 +88,8 @@ def picture(path, curves):
     figure, axes = plt.subplots(2, 2, figsize=(9, 6), sharex="col", constrained_layout=True)
     for column, (label, done) in zip(axes.T, curves.items()):
         sizes = np.array([size for size, _ in done], float)
-        for axis, key, name in zip(column, ("each", "memory"), ("ms per iteration, all told", "memory above CASA [MB]")):
+        for axis, key, name in zip(column, ("each", "memory"),
+                                   ("ms per iteration, all told", "memory above CASA [MB]")):
             values = np.array([made[key] for _, made in done])
             axis.loglog(sizes, values, "o-", color="#0072B2", label="measured")
             axis.loglog(sizes, values[-1] * sizes / sizes[-1], ":", color="0.4", label="proportional")

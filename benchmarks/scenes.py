@@ -96,7 +96,8 @@ def scene_sky(name: str, cell_arcsec: float = 0.06, flux_jy: float = FLUX_JY, ov
 
 
 def _between_pixels(image, size):
-    """Interpolate an image to (size, size) by cubic splines, half a pixel of the image to be made off its grid; never negative."""
+    """Interpolate an image to (size, size) by cubic splines, half a pixel of the image to be made off its grid;
+    never negative."""
     places = (np.arange(size) - size // 2) * (image.shape[0] / size) + image.shape[0] // 2 + 0.5 * image.shape[0] / SIZE
     fine = map_coordinates(image, np.meshgrid(places, places, indexing="ij"), order=3, mode="constant")
     return np.clip(fine, 0, None)

@@ -2,9 +2,9 @@
 
     python benchmarks/schedule.py FOLDER [--cases M31] [--against BEFORE.json]
 
-Observations are those of quality.py; the solution is that of the task with defaults on one thread, two cases at a time. SNRs
-are those of the model, smoothed to half of and to the whole beam that the longest baseline and Briggs' weights give, 1.2 of its
-fringe. The results are written to FOLDER/schedule.json, which a later run can be held `--against`.
+Observations are those of quality.py; the solution is that of the task with defaults on one thread, two cases at a time.
+SNRs are those of the model, smoothed to half of and to the whole beam that the longest baseline and Briggs' weights
+give, 1.2 of its fringe. The results are written to FOLDER/schedule.json, which a later run can be held `--against`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ def solved(case: Case, base: Path) -> dict:
     sky, simulated, part, density, grid = observed(case, base)
     found = reconstruct(Samples(part.data, part.offsets, density, part.noise), grid, SolverOptions(nthreads=1))
     ratio = found.l2_bounds / simulated["errors"]
-    result = dict(iterations=found.record.iteration[-1], stop=found.record.stop_description, raw=snr(sky.truth(), found.model),
+    result = dict(iterations=found.record.iteration[-1], stop=found.record.stop_description,
+                  raw=snr(sky.truth(), found.model),
                   bounds=(float(ratio.min()), float(ratio.max())))
     for name, factor in (("half", 0.5), ("one", 1.0)):
         fwhm = 2 * [factor * 2 * WIDTH * case.super_resolution]
@@ -74,13 +75,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--cases", default="", help="only cases whose label holds this")
-    parser.add_argument("--oversampling", type=int, default=3, help="pixels of the sky in one of the image; 1: the image's own")
+    parser.add_argument("--oversampling", type=int, default=3,
+                        help="pixels of the sky in one of the image; 1: the image's own")
     parser.add_argument("--against", type=Path, help="the results of an earlier run")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     base, grid = options.folder.resolve(), [case for case in cases(options.oversampling) if options.cases in case.label]
     earlier = json.loads(options.against.read_text()) if options.against else {}
-    print(f"{machine()}\n\n| case | iterations | SNR, dB | at half a beam | at one beam | bounds / true | |\n" + "|---" * 7 + "|")
+    print(f"{machine()}\n\n| case | iterations | SNR, dB | at half a beam | at one beam | bounds / true | |\n"
+          + "|---" * 7 + "|")
     results = {}
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
         for case, result in zip(grid, pool.map(partial(solved, base=base), grid)):
@@ -91,8 +94,8 @@ def main():
     if both:
         change = [results[name]["half"] - earlier[name]["half"] for name in both]
         sums = [sum(those[name]["iterations"] for name in both) for those in (earlier, results)]
-        print(f"\n{len(both)} cases: {sums[0]} → {sums[1]} iterations; at half a beam {min(change):+.2f} to {max(change):+.2f}, "
-              f"median {np.median(change):+.2f} dB.")
+        print(f"\n{len(both)} cases: {sums[0]} → {sums[1]} iterations; at half a beam {min(change):+.2f} to "
+              f"{max(change):+.2f}, median {np.median(change):+.2f} dB.")
 
 
 if __name__ == "__main__":

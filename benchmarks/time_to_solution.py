@@ -2,13 +2,13 @@
 
     python benchmarks/time_to_solution.py FOLDER [--scenes cyga M31 W28] [--repeat 3] [--known briggs short]
 
-Scenes and settings are those of quality.py. The best tclean multiscale run of a scene is that of its five settings and two
-weightings whose model has the highest SNR to the truth; all ten are tried first, and their own spread is not counted against
-anybody; --known leaves the search out. wsclean (where it is installed) runs multiscale with Briggs −1 and natural weights, each
-with its automatic threshold at one and two times the noise and an automatic mask; its best is taken in the same way. Then the best
-runs and tsara take turns, every run in a new process: time is that of the call, reading and writing included, importing not.
-tclean runs with one and with two OpenMP threads, and the faster counts. SNR = 20 log10(‖truth‖/‖truth − model‖), of the models as they are and smoothed to half the
-beam of tclean.
+Scenes and settings are those of quality.py. The best tclean multiscale run of a scene is that of its five settings and
+two weightings whose model has the highest SNR to the truth; all ten are tried first, and their own spread is not
+counted against anybody; --known leaves the search out. wsclean (where it is installed) runs multiscale with Briggs −1
+and natural weights, each with its automatic threshold at one and two times the noise and an automatic mask; its best is
+taken in the same way. Then the best runs and tsara take turns, every run in a new process: time is that of the call,
+reading and writing included, importing not. tclean runs with one and with two OpenMP threads, and the faster counts.
+SNR = 20 log10(‖truth‖/‖truth − model‖), of the models as they are and smoothed to half the beam of tclean.
 """
 
 from __future__ import annotations
@@ -71,8 +71,10 @@ def best_clean(case, folder, known=None):
     cell = float(parameters["cell"].removesuffix("arcsec"))
     scales, bias, niter = GRID[best["setting"]]
     width = np.sqrt(best["beam"][0] * best["beam"][1]) / cell
-    parameters.update(weighting=best["weighting"], robust=WEIGHTINGS[best["weighting"]], nsigma=2.0, deconvolver="multiscale",
-                      scales=sorted({round(scale * width) for scale in scales}), smallscalebias=bias, niter=niter, gain=0.2)
+    parameters.update(weighting=best["weighting"], robust=WEIGHTINGS[best["weighting"]], nsigma=2.0,
+                      deconvolver="multiscale",
+                      scales=sorted({round(scale * width) for scale in scales}), smallscalebias=bias, niter=niter,
+                      gain=0.2)
     return best, parameters
 
 
@@ -83,8 +85,10 @@ def run_wsclean(case, folder, weighting, sigma):
     (nx, ny), cell = parameters["imsize"], parameters["cell"].removesuffix("arcsec")
     weight = ["briggs", str(WEIGHTINGS[weighting])] if weighting == "briggs" else [weighting]
     root = folder / f"wsclean_{weighting}_{sigma}"
-    command = ["wsclean", "-j", str(CORES), "-size", str(nx), str(ny), "-scale", f"{cell}asec", "-weight", *weight, "-multiscale",
-               "-niter", "1000000", "-mgain", "0.8", "-auto-threshold", str(sigma), "-auto-mask", "5", "-data-column", "DATA",
+    command = ["wsclean", "-j", str(CORES), "-size", str(nx), str(ny), "-scale", f"{cell}asec", "-weight", *weight,
+               "-multiscale",
+               "-niter", "1000000", "-mgain", "0.8", "-auto-threshold", str(sigma), "-auto-mask", "5", "-data-column",
+               "DATA",
                "-no-update-model-required", "-pol", "I", "-name", str(root), *parameters["vis"]]
     begin = time.perf_counter()
     with open(folder / "wsclean.txt", "w") as log:
@@ -123,9 +127,9 @@ def scene(name, base, repeat, known):
     for imager, seconds in times.items():
         if seconds:
             score, low, middle, high = found[imager], *np.percentile(seconds, (0, 50, 100))
-            print(f"| {name} | {imager} | {settings[imager]} | {middle:.1f} ({low:.1f}–{high:.1f}) | {middle / quickest:.1f} "
-                  f"| {score['raw']:.1f} | {found['tsara']['raw'] - score['raw']:+.1f} | {score['0.5']:.1f} "
-                  f"| {found['tsara']['0.5'] - score['0.5']:+.1f} |", flush=True)
+            print(f"| {name} | {imager} | {settings[imager]} | {middle:.1f} ({low:.1f}–{high:.1f}) | "
+                  f"{middle / quickest:.1f} | {score['raw']:.1f} | {found['tsara']['raw'] - score['raw']:+.1f} | "
+                  f"{score['0.5']:.1f} | {found['tsara']['0.5'] - score['0.5']:+.1f} |", flush=True)
 
 
 def main():
@@ -136,8 +140,8 @@ def main():
     parser.add_argument("--known", nargs=2, metavar=("WEIGHTING", "SETTING"), help="tclean's best")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
-    print(f"{machine()}\n\n| scene | imager | settings | s (least–greatest) | of tsara's time | SNR, dB | tsara's margin | at half beam "
-          "| tsara's margin |\n" + "|---" * 9 + "|", flush=True)
+    print(f"{machine()}\n\n| scene | imager | settings | s (least–greatest) | of tsara's time | SNR, dB | tsara's "
+          "margin | at half beam | tsara's margin |\n" + "|---" * 9 + "|", flush=True)
     for name in options.scenes:
         scene(name, options.folder.resolve(), options.repeat, options.known)
 

@@ -3,8 +3,8 @@
     OMP_NUM_THREADS=1 python benchmarks/widefield.py [--size 1024] [--samples 300000] [--eps 1e-5]
 
 One line for each largest phase in the image: the way taken; the time of a pair (forward and adjoint) and of a whole
-iteration of the solver relative to gridder='standard', in CPU time of one thread; and the errors of the visibilities of a
-random image, of 200 of them, relative to their rms: with the w-term, and without it.
+iteration of the solver relative to gridder='standard', in CPU time of one thread; and the errors of the visibilities of
+a random image, of 200 of them, relative to their rms: with the w-term, and without it.
 """
 
 import argparse
@@ -39,14 +39,16 @@ def exact(uvw, image):
     l, m = (sign * (np.arange(n) - n // 2) * CELL for sign, n in zip((-1, 1), image.shape))
     depth = np.sqrt(1 - l[:, None] ** 2 - m[None, :] ** 2) - 1
     turn = 2j * np.pi
-    return np.array([np.exp(turn * u * l) @ (image * np.exp(turn * w * depth)) @ np.exp(turn * v * m) for u, v, w in uvw.T])
+    return np.array([np.exp(turn * u * l) @ (image * np.exp(turn * w * depth)) @ np.exp(turn * v * m)
+                     for u, v, w in uvw.T])
 
 
 def step(operator):
     """Return the iteration of a solver with this operator."""
     vis, ones = np.ones(operator.size, np.complex64), np.ones(operator.size, np.float32)
     dictionary = SaraDictionary(operator.shape)
-    ppd = AdaptivePPD(operator, dictionary, vis, [0, operator.size], ones, float(operator.size) * np.prod(operator.shape))
+    ppd = AdaptivePPD(operator, dictionary, vis, [0, operator.size], ones,
+                      float(operator.size) * np.prod(operator.shape))
     ppd.threshold = 1.0
     return ppd.step
 
@@ -66,7 +68,8 @@ def main():
     print(f"{args.size}² pixels, {args.samples} visibilities, eps {args.eps:g}: standard {1e3 * pair:.0f} ms a pair, "
           f"{1e3 * whole:.0f} ms an iteration")
     for phase in PHASES:
-        w = np.append(rng.uniform(-1, 1, args.samples - 1), 1) * phase / WTerm.of(1.0, shape, (CELL, CELL), args.eps).phase
+        w = np.append(rng.uniform(-1, 1, args.samples - 1), 1) * phase / WTerm.of(1.0, shape, (CELL, CELL),
+                                                                                  args.eps).phase
         uvw = np.stack([*uv, w])
         operators = [w_operator(uvw, CELL, shape, eps=args.eps)]
         if not isinstance(operators[0], WGridder):
@@ -79,8 +82,9 @@ def main():
         terms = WTerm.of(w.max(), shape, (CELL, CELL), args.eps).terms
         way = f"{terms} terms" if terms else f"w-gridder ({terms_needed(phase / 2, args.eps / 4)} terms)"
         other = f", w-gridder {times[1]:.0f}" if terms else ""
-        print(f"{phase:6g} rad: {way}, pair {times[0]:.1f}{other}, iteration {seconds(step(operators[0]), 2) / whole:.1f}, "
-              f"error {wrong[0]:.1e}, without the w-term {wrong[1]:.1e}", flush=True)
+        print(f"{phase:6g} rad: {way}, pair {times[0]:.1f}{other}, iteration "
+              f"{seconds(step(operators[0]), 2) / whole:.1f}, error {wrong[0]:.1e}, without the w-term {wrong[1]:.1e}",
+              flush=True)
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ class Selection:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """I(ν) = I(ν0)·(ν/ν0)^α: the index α, one number or a real image (nx, ny), and ν0 = `reference_hz`, where the image is."""
+    """I(ν) = I(ν0)·(ν/ν0)^α: the index α, one number or a real image (nx, ny), and ν0 = `reference_hz`, the image's."""
 
     index: Any
     reference_hz: float
@@ -58,9 +58,9 @@ class Spectrum:
 class ImageGrid:
     """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
 
-    `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis are
-    '', a channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say where the
-    model may be.
+    `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis
+    are '', a channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say
+    where the model may be.
     """
 
     shape: tuple[int, int]
@@ -136,8 +136,8 @@ class Output:
     """Where results go, and what goes along.
 
     `restoringbeam` is None when no restored image is wanted; `history` holds the lines written into every image;
-    `resume` says to go on from the checkpoint. `pbcor` asks for the images divided by the primary beam. With `images_stand`
-    the products of an earlier run stay as they are, and only the model column is written.
+    `resume` says to go on from the checkpoint. `pbcor` asks for the images divided by the primary beam. With
+    `images_stand` the products of an earlier run stay as they are, and only the model column is written.
     """
 
     imagename: str

@@ -2,7 +2,8 @@
 
     mpirun -n 3 python mpi_steps.py steps.json
 
-A step is [kind, task parameters]; every rank adds its outcome to a file of its own, steps.json.RANK, as one line of JSON.
+A step is [kind, task parameters]; every rank adds its outcome to a file of its own, steps.json.RANK, as one line of
+JSON.
 """
 
 import contextlib

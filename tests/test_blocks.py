@@ -1,4 +1,5 @@
-"""Blocks that the user selects, and the blocks that are pointed out: against the columns of the data and the noise put in."""
+"""Blocks that the user selects, and the blocks that are pointed out:
+against the columns of the data and the noise put in."""
 
 import numpy as np
 import pytest
@@ -38,8 +39,10 @@ def _bad(name):
 def clock_range(name, rows):
     """The time range of rows, in the words of the data selection."""
     time = column(name, "TIME")[rows]
-    ends = [np.datetime64("1858-11-17") + np.timedelta64(round(1000 * (t + step)), "ms") for t, step in ((time.min(), -4),
-                                                                                                          (time.max(), 4))]
+    ends = [np.datetime64("1858-11-17") + np.timedelta64(round(1000 * (t + step)), "ms")
+            for t, step in ((time.min(), -4),
+                                                                                                          (time.max(),
+                                                                                                           4))]
     return "~".join(str(end).replace("-", "/").replace("T", "/") for end in ends)
 
 
@@ -52,13 +55,15 @@ def read(vis):
     (("vis=1 scan=1,3",), lambda rows: [(rows["ms"] == 1) & (rows["scan"] != 2)]),
     (("spw=1", "scan=2"), lambda rows: [rows["spw"] == 1, (rows["spw"] == 0) & (rows["scan"] == 2)]),
     (("spw=0:1 vis=1",), lambda rows: [(rows["ms"] == 1) & (rows["spw"] == 0) & (rows["chan"] == 1)]),
-    (("vis=0", "antenna=A03"), lambda rows: [rows["ms"] == 0, (rows["ms"] == 1) & ((rows["one"] == 3) | (rows["two"] == 3))]),
+    (("vis=0", "antenna=A03"),
+     lambda rows: [rows["ms"] == 0, (rows["ms"] == 1) & ((rows["one"] == 3) | (rows["two"] == 3))]),
 ])
 def test_entries_set_apart_what_they_name(vis, entries, expected):
     data = read(vis)
     table = data.rows
     rows = {name: values[data.row] for name, values in dict(
-        ms=table.ms, scan=table.scan, spw=table.spw, one=table.antenna1, two=table.antenna2).items()} | dict(chan=data.chan)
+        ms=table.ms, scan=table.scan, spw=table.spw, one=table.antenna1,
+        two=table.antenna2).items()} | dict(chan=data.chan)
     block, infos = divide(data, entries)
     apart = expected(rows)
     for named in (*apart, ~np.any(apart, axis=0)):
@@ -83,7 +88,8 @@ def test_entries_that_name_nothing_are_refused(vis, entry, message):
 
 
 def test_an_entry_inside_an_earlier_one_is_refused(vis):
-    with pytest.raises(ValueError, match="blocks = 'scan=1' selects only visibilities that earlier entries have selected"):
+    with pytest.raises(ValueError,
+                       match="blocks = 'scan=1' selects only visibilities that earlier entries have selected"):
         divide(read(vis), ("vis=0~1 scan=1~2", "scan=1"))
 
 
@@ -107,7 +113,8 @@ def test_a_bad_stretch_of_time_gets_its_own_bound_and_is_named(vis):
     assert len(found) == 4 and found[-1] == pytest.approx(WORSE, rel=0.1)
     assert found[:-1] == pytest.approx([1, 1, 1], rel=0.1)
     (suspect,) = record["suspects"]
-    assert suspect["block"] == 3 and suspect["reason"] == "thermal noise" and suspect["others"] == pytest.approx(1, rel=0.1)
+    assert suspect["block"] == 3 and suspect["reason"] == "thermal noise" and suspect["others"] == pytest.approx(1,
+                                                                                                                 rel=0.1)
     whole = tsara(imagename="y", **common)["sara"]["blocks"]
     assert len(whole) == 3 and whole[1]["noise_found"] == pytest.approx(np.sqrt((1 + WORSE**2) / 2), rel=0.15)
 

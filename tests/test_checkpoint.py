@@ -111,12 +111,15 @@ def test_a_hostile_file_is_refused_and_nothing_executed(tmp_path):
     archive = io.BytesIO()
     np.savez(archive, model=np.array([Payload(trap)], object))
     entry = dict(name="model", dtype="|O", shape=[len(poison) // 8], sha256=hashlib.sha256(poison).hexdigest())
-    hostile = [poison, archive.getvalue(), b"\0" * 1000, forged(dict(state={}, arrays=[entry])) + poison, forged(poison)]
-    for change in (dict(dtype="O"), dict(dtype="f4,O"), dict(dtype="__import__('os')"), dict(dtype="<f4", shape=[2**62, 4]),
+    hostile = [poison, archive.getvalue(), b"\0" * 1000, forged(dict(state={}, arrays=[entry])) + poison,
+               forged(poison)]
+    for change in (dict(dtype="O"), dict(dtype="f4,O"), dict(dtype="__import__('os')"),
+                   dict(dtype="<f4", shape=[2**62, 4]),
                    dict(dtype="<f4", shape=[-1, -4]), dict(dtype="<f4", shape="ab"), dict(dtype=["<f4"]),
                    dict(dtype="<f4", shape=[1], name="__class__/__init__")):
         hostile.append(forged(dict(state={}, arrays=[entry | change])) + poison)
-    hostile += [forged(b"[" * 100_000), forged(b"null"), forged(b"[]"), forged(b"{}"), forged(b'{"state": 3, "arrays": 4}'),
+    hostile += [forged(b"[" * 100_000), forged(b"null"), forged(b"[]"), forged(b"{}"),
+                forged(b'{"state": 3, "arrays": 4}'),
                 MAGIC + struct.pack("<Q", 2**63) + b"\0" * 64]
     for content in hostile:
         path.write_bytes(content)
@@ -179,7 +182,8 @@ def test_a_checkpoint_of_something_else_is_refused_with_the_difference(tmp_path)
     opened(path).identify(**data)
     for change, message in [
         (dict(version="2"), "another version of casa_sara: 1, and this is 2"),
-        (dict(parameters=dict(cell=(0.1, 0.1), niter=6)), "other parameters: niter was 5 and is 6.*Use the same data and parameters"),
+        (dict(parameters=dict(cell=(0.1, 0.1), niter=6)),
+         "other parameters: niter was 5 and is 6.*Use the same data and parameters"),
         (dict(parameters=dict(cell=(0.1, 0.1), niter=5, regscale=2.0)), "regscale was None and is 2.0"),
     ]:
         with pytest.raises(CheckpointError, match=f"restart = True: '{path}' cannot be continued.*{message}"):
@@ -200,7 +204,8 @@ def solution(problem, adaptive):
     ppd = AdaptivePPD(problem.measurement, problem.dictionary, problem.vis, problem.offsets, problem.precond,
                       problem.data_norm_sq(problem.precond))
     weights = np.abs(problem.measurement.matrix[:, 0]) ** 2
-    common = dict(samples=np.diff(problem.offsets), weight_sums=np.add.reduceat(weights, problem.offsets[:-1]), n_bases=3)
+    common = dict(samples=np.diff(problem.offsets), weight_sums=np.add.reduceat(weights, problem.offsets[:-1]),
+                  n_bases=3)
     if adaptive:
         return ppd, AdaptiveBounds(3 * problem.errors, **common)
     return ppd, GivenBounds(1.02 * problem.errors, **common)
@@ -338,7 +343,8 @@ def test_a_state_that_does_not_fit_is_refused(sky, tmp_path):
     path = tmp_path / "c"
     image(sky, path, 3)
     header, right = read(str(path))
-    for room, name, value in [("ppd", "model", np.zeros((48, 40), np.float32)), ("ppd", "l2_dual", np.zeros(3, complex)),
+    for room, name, value in [("ppd", "model", np.zeros((48, 40), np.float32)),
+                              ("ppd", "l2_dual", np.zeros(3, complex)),
                               ("found", "left_out", "all"), ("stage", "record", {}), ("bounds", "l2_bounds", None)]:
         wrong = right | {room: {key: entry for key, entry in right[room].items() if key != name or value is not None}}
         if value is not None:

@@ -1,4 +1,5 @@
-"""method='dabbech2018': Algorithms 1 and 2 against a few lines of dense algebra in the paper's symbols, and the task."""
+"""method='dabbech2018': Algorithms 1 and 2 against a few lines of dense algebra in the paper's symbols,
+and the task."""
 
 import copy
 import os
@@ -125,7 +126,8 @@ def scene(seed=3, samples=(90, 120, 60), noise=(0.3, 0.3, 0.9)):
     error = np.repeat(noise, samples) * (rng.normal(size=uv.shape[1]) + 1j * rng.normal(size=uv.shape[1]))
     precond = np.exp(-((0.3 - np.hypot(*uv) * CELL).clip(0) / 0.12) ** 2)
     offsets = np.concatenate([[0], np.cumsum(samples)])
-    return SimpleNamespace(uv=uv, y=fourier_matrix(uv) @ sky.ravel() + error, U=precond / precond.max(), offsets=offsets,
+    return SimpleNamespace(uv=uv, y=fourier_matrix(uv) @ sky.ravel() + error, U=precond / precond.max(),
+                           offsets=offsets,
                            sky=sky, blocks=[slice(a, b) for a, b in zip(offsets[:-1], offsets[1:])])
 
 
@@ -171,7 +173,8 @@ def bounds_of(problem, start, **more):
 
 
 def compare(par, factors):
-    """Assert that ours and the dense algebra agree in every iteration, from NNLS bounds × factors; return the record."""
+    """Assert that ours and the dense algebra agree in every iteration, from NNLS bounds × factors;
+    return the record."""
     problem = scene()
     start = first_bounds(problem) * factors
     kappa = par.kappa * problem.sky.max()
@@ -224,7 +227,8 @@ def test_a_solution_goes_on_from_any_iteration():
     moves = [one for one, _ in record.bounds]
     # the last move after which P holds the next back
     soon = [one for one, following in zip(moves, moves[1:]) if following - one == QUICK.interval][-1]
-    moments = [3, soon + 2, soon + QUICK.interval - 1, *(update["iteration"] + 3 for update in record.reweightings[::3])]
+    moments = [3, soon + 2, soon + QUICK.interval - 1,
+               *(update["iteration"] + 3 for update in record.reweightings[::3])]
     for moment in moments:
         kept, ppd, bounds = [], iteration(problem), bounds_of(problem, start)
 

@@ -175,7 +175,8 @@ def test_pointing_errors_are_gains_that_grow_from_the_centre(tmp_path):
     assert np.std(ratios["east"].real) == pytest.approx(0.5 * np.sqrt(2) * rms, rel=0.3)
     table_of = np.zeros((27, 27))
     table_of[first[:351], second[:351]] = ratios["north"].real[:351] - 1
-    assert table_of[0, 1] + table_of[2, 3] == pytest.approx(table_of[0, 2] + table_of[1, 3], abs=1e-5)  # a sum of antennas
+    # a sum of antennas
+    assert table_of[0, 1] + table_of[2, 3] == pytest.approx(table_of[0, 2] + table_of[1, 3], abs=1e-5)
     assert abs(table_of[0, 1] - table_of[0, 2]) > 1e-3
     assert abs(np.corrcoef(ratios["east"].real, ratios["north"].real)[0, 1]) < 0.3  # the axes for themselves
 

@@ -254,5 +254,6 @@ def test_bad_arrays():
 
 def test_cached_code_knows_its_source():
     """Numba's cache watches _wavelet_kernels.py only; SOURCE there makes it change together with the other files."""
-    digest = hashlib.sha256(b"".join(Path(module.__file__).read_bytes() for module in (_vectors, _filter_bank, _wavelet_lines)))
+    digest = hashlib.sha256(b"".join(Path(module.__file__).read_bytes()
+                                     for module in (_vectors, _filter_bank, _wavelet_lines)))
     assert _wavelet_kernels.SOURCE == digest.hexdigest()[:12], f"set SOURCE = {digest.hexdigest()[:12]!r}"

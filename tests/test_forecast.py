@@ -56,7 +56,8 @@ def test_run_that_does_not_fit_is_refused_with_what_would(vis, tmp_path, monkeyp
     monkeypatch.setattr(dry_run, "available_memory", lambda: 10**9)
     grid = GRID | dict(imsize=4000, cell="0.5arcsec")
     held = machine.resident_memory()
-    with pytest.raises(MemoryError, match=r"imsize = \[4000, 4000\].*wavelet duals.*the memory available.*imsize up to"):
+    with pytest.raises(MemoryError,
+                       match=r"imsize = \[4000, 4000\].*wavelet duals.*the memory available.*imsize up to"):
         tsara(vis=vis, imagename=str(tmp_path / "huge"), **grid)
     assert machine.resident_memory() - held < 10**8 and os.listdir(tmp_path) == []
     dry = tsara(vis=vis, imagename=str(tmp_path / "huge"), dryrun=True, **grid)["forecast"]
@@ -77,7 +78,8 @@ def test_what_is_said_to_fit_does():
     found = forecast(WORK, 300_000_000, 400_000_000)
     with pytest.raises(MemoryError) as refusal:
         found.require(0.0)
-    nx, ny, samples = map(int, re.search(r"imsize up to \[(\d+), (\d+)\] or at most (\d+) vis", str(refusal.value)).groups())
+    nx, ny, samples = map(int,
+                          re.search(r"imsize up to \[(\d+), (\d+)\] or at most (\d+) vis", str(refusal.value)).groups())
     assert nx == pytest.approx(2 * ny, abs=4)
 
     def fits(**changed):
@@ -122,14 +124,16 @@ def test_flags_are_read_before_a_run_is_refused(vis, tmp_path, monkeypatch):
     copy = shutil.copytree(vis, tmp_path / "flagged.ms")
     edit(copy, "FLAG", lambda flag: flag | (np.arange(flag.shape[-1]) % 10 > 0))
     full = measure_volume(Selection((str(copy),), datacolumn="data")).samples
-    monkeypatch.setattr(dry_run, "forecast", lambda work, *rest: forecast(work, 0, 0 if work.samples == full else 10**12))
+    monkeypatch.setattr(dry_run, "forecast", lambda work,
+                        *rest: forecast(work, 0, 0 if work.samples == full else 10**12))
     said = tsara(vis=str(copy), imagename=str(tmp_path / "some"), dryrun=True, **GRID)["forecast"]
     assert said["fits"] and said["visibilities"] < 0.2 * full
 
 
 def test_time_limit_delivers_the_image(vis, tmp_path):
     """A run that re-weights for ever ends, with its images written."""
-    made = tsara(vis=vis, imagename=str(tmp_path / "short"), maxtime="6s", reltol=0.0, reweighttol=0.0, nreweights=10**6,
+    made = tsara(vis=vis, imagename=str(tmp_path / "short"), maxtime="6s", reltol=0.0, reweighttol=0.0,
+                 nreweights=10**6,
                  **GRID)
     assert (made["stopcode"], made["stopDescription"]) == (TIME_LIMIT, "time limit")
     assert made["summaryminor"][0][0][0]["modelFlux"][0] > 0.2

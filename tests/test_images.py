@@ -218,7 +218,8 @@ def test_products_and_restored_image_are_tcleans(name, runs, tmp_path, case, res
     for product in PRODUCTS:
         made = contents(ours + product)
         scale = np.abs(reference[product]["pixels"]).max()
-        np.testing.assert_allclose(made["pixels"], reference[product]["pixels"], rtol=0, atol=4e-7 * scale, err_msg=product)
+        np.testing.assert_allclose(made["pixels"], reference[product]["pixels"], rtol=0, atol=4e-7 * scale,
+                                   err_msg=product)
         for what in ("mask", "masks", "unit"):
             np.testing.assert_array_equal(made[what], reference[product][what], err_msg=product)
         assert_same_record(made["csys"], reference[product]["csys"], product)

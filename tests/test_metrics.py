@@ -222,14 +222,16 @@ def test_regions_keep_their_shape_in_oblong_cells():
     for mask, by_hand, edge in zip(masks.values(), (np.hypot(x, y) < 4, (abs(x) < 2.95) & (abs(y) < 3.95)),
                                    (abs(np.hypot(x, y) - 4) < 0.01, np.zeros(x.shape, bool))):
         assert not (mask ^ by_hand)[~edge].any() and mask.sum() > 300
-    for text in ("299.87deg 40.73deg 13arcsec", "299.8637deg 40.73deg 0.1arcsec"):  # 25 arcsec high; 17 of 16 to the west
+    # 25 arcsec high; 17 of 16 to the west
+    for text in ("299.87deg 40.73deg 13arcsec", "299.8637deg 40.73deg 0.1arcsec"):
         with pytest.raises(ValueError, match="beyond the image|outside the image"):
             region_masks([text], frame)
     assert region_masks(["299.8650deg 40.73deg 1arcsec"], frame)  # 14 to the west
 
 
 def test_a_file_with_a_line_that_is_not_understood_is_refused(tmp_path):
-    (tmp_path / "half.reg").write_text('# Region file format: DS9\nfk5\ncircle(299.87,40.73,4")\nblob(299.87,40.73,4")\n')
+    (tmp_path
+     / "half.reg").write_text('# Region file format: DS9\nfk5\ncircle(299.87,40.73,4")\nblob(299.87,40.73,4")\n')
     with pytest.raises(ValueError, match="regions = 'half.reg' is not a region.*blob"):
         region_masks(["half.reg"], FRAME)
 

@@ -23,7 +23,8 @@ CENTRE = "J2000 19h59m33s +40d43m02s"
 @pytest.fixture(scope="module")
 def observation(tmp_path_factory):
     """Four correlations, two spws, a few flags, no MODEL_DATA: never written to."""
-    name = simulate(tmp_path_factory.mktemp("ms") / "a.ms", configuration="b", antennas=6, correlations="RR RL LR LL", sky=SKY,
+    name = simulate(tmp_path_factory.mktemp("ms") / "a.ms", configuration="b", antennas=6, correlations="RR RL LR LL",
+                    sky=SKY,
                     fields=(CYGNUS_A, CENTRE), spws=(("8.4GHz", "2MHz", 4), ("8.6GHz", "2MHz", 2)))  # fmt: skip
     rng = np.random.default_rng(1)
     edit(name, "FLAG", lambda old: rng.random(old.shape) < 0.2)

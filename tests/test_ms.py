@@ -106,13 +106,15 @@ def assert_same_samples(vis, samples):
 
 @pytest.mark.parametrize(
     ("correlations", "hands"),
-    [("RR LL", (0, 1)), ("LL RR", (0, 1)), ("XX YY", (0, 1)), ("RR RL LR LL", (0, 3)), ("LL RL LR RR", (0, 3)), ("XX", (0,)),
+    [("RR LL", (0, 1)), ("LL RR", (0, 1)), ("XX YY", (0, 1)), ("RR RL LR LL", (0, 3)), ("LL RL LR RR", (0, 3)),
+     ("XX", (0,)),
      ("LL", (0,))],
 )
 def test_samples_equal_a_cell_by_cell_read(tmp_path, correlations, hands):
     rng = np.random.default_rng(1)
     count = len(correlations.split())
-    name = simulate(tmp_path / "a.ms", antennas=6, correlations=correlations, noise=0.1 * np.arange(1, count + 1), autocorrelations=True,
+    name = simulate(tmp_path / "a.ms", antennas=6, correlations=correlations, noise=0.1 * np.arange(1, count + 1),
+                    autocorrelations=True,
                     columns=("DATA", "CORRECTED_DATA"))  # fmt: skip
 
     def spoil(share, value):
@@ -136,7 +138,8 @@ def test_samples_equal_a_cell_by_cell_read(tmp_path, correlations, hands):
 
 def test_dtypes_and_layout(observation):
     vis = read(observation)
-    dtypes = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64, "row": np.int32,
+    dtypes = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64,
+              "row": np.int32,
               "chan": np.int16}
     for name, dtype in dtypes.items():
         array = getattr(vis, name)
@@ -308,7 +311,8 @@ def tclean_products(vis, folder, **parameters):
     name = os.path.join(str(folder), "dirty")
     for path in Path(folder).glob("dirty.*"):
         shutil.rmtree(path)
-    tclean(vis, imagename=name, imsize=64, niter=0, calcres=False, restoration=False, **({"cell": "1arcsec"} | parameters))
+    tclean(vis, imagename=name, imsize=64, niter=0, calcres=False, restoration=False,
+           **({"cell": "1arcsec"} | parameters))
     ia = casatools.image()
     ia.open(name + ".sumwt")
     weight = float(ia.getchunk().ravel()[0])
@@ -352,7 +356,8 @@ def test_several_measurement_sets_are_their_union(observation, tmp_path):
     other = simulate(tmp_path / "other.ms", configuration="c", sky=SKY, noise=0.1, date="2015/09/01")
     both, first, second = read(observation, other), read(observation), read(other)
     for name in ("vis", "weight", "uvw"):
-        assert np.array_equal(getattr(both, name), np.concatenate([getattr(first, name), getattr(second, name)], axis=-1))
+        assert np.array_equal(getattr(both, name),
+                              np.concatenate([getattr(first, name), getattr(second, name)], axis=-1))
     assert np.array_equal(both.rows.ms[both.row], np.repeat([0, 1], [first.size, second.size]))
     assert both.spws == {0: (0, 1), 1: (0,)} and both.freq_range_hz[0] <= first.freq_range_hz[0]
     assert sum(str(other) in note and "CORRECTED_DATA" in note for note in both.notes) == 1
@@ -445,7 +450,8 @@ def test_measurement_set_without_rows(observation, tmp_path):
 @pytest.mark.parametrize(
     ("col", "change", "message"),
     [
-        ("FLAG_ROW", np.ones_like, "no usable visibilities: .*1008 samples|no usable visibilities: .* left out as flagged row"),
+        ("FLAG_ROW", np.ones_like,
+         "no usable visibilities: .*1008 samples|no usable visibilities: .* left out as flagged row"),
         ("WEIGHT", np.zeros_like, "no usable visibilities: .* left out as non-positive weight"),
         ("UVW", lambda old: old * np.nan, "no usable visibilities: .* left out as non-finite uvw"),
         ("ANTENNA1", np.zeros_like, None),

@@ -93,7 +93,8 @@ def test_nan_where_it_cannot_be_measured():
 
 
 def test_rows_that_are_hardly_weighed_do_not_hide_the_noise_of_the_others():
-    """The bound of a block needs the rms of its whitened samples: of 40 % with the noise that was put in, and of 60 % of nothing."""
+    """The bound of a block needs the rms of its whitened samples: of 40 % with the noise that was put in,
+    and of 60 % of nothing."""
     vis = noisy(ONE_SCAN, 2.0, channels=8)
     light = np.random.default_rng(7).random(vis.rows.row.size)[vis.row] < 0.6
     vis.weight[light] *= 1e-8

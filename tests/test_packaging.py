@@ -22,8 +22,9 @@ NOT_IMPORTED = {
 CASA = {"casaconfig", "casatools", "casatasks"}
 OF_USERS = {"casampi"}  # CASA's own, used where it is in charge
 
-# What each package may import beside itself and the standard library. The order of the packages is held by import-linter
-# (pyproject.toml); this table holds who may use which library, and that no package reaches for more than it needs.
+# What each package may import beside itself and the standard library. The order of the packages is held by
+# import-linter (pyproject.toml); this table holds who may use which library, and that no package reaches for more than
+# it needs.
 NUMERICS = {"data", "operators", "solver", "reconstruction", "parallel", "analysis"}
 LIBRARY = NUMERICS - {"analysis"} | {"runtime", "options"}
 OF_CASA = {"casa.ms", "casa.images", "casa.runtime"}
@@ -34,7 +35,8 @@ PACKAGES = {
     "tasks": {"private"},
     "gotasks": {"private", "tasks"},
     "private": {
-        "analysis", "comparison", "imaging", "options", "parallel", "runtime", "solver", "version", "numpy", "casashell", "mpi4py",
+        "analysis", "comparison", "imaging", "options", "parallel", "runtime", "solver", "version", "numpy",
+        "casashell", "mpi4py",
         *OF_CASA, *OF_USERS, *CASA,
     },
     "demo": {"__init__", "analysis", "comparison", "options", "runtime", "numpy", "finufft", "matplotlib", *CASA},

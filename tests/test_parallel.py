@@ -71,7 +71,8 @@ def alone(vis, folder):
 def _runs(vis, folder, **more):
     """The runs that all numbers of ranks do.
 
-    Re-weighted; with hard bounds, equal blocks and uniform weights; and with w-term, spectrum, mask and a block by name.
+    Re-weighted; with hard bounds, equal blocks and uniform weights; and with w-term, spectrum, mask and a block by
+    name.
     """
     folder.mkdir(exist_ok=True)
     common = dict(vis=vis, **GRID, **more)
@@ -92,7 +93,8 @@ def _mpirun(ranks, steps, folder):
                        PYTHONPATH=os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
     version = subprocess.run(["mpirun", "--version"], capture_output=True, text=True).stdout
     over = ["--oversubscribe"] if "Open MPI" in version else []
-    done = subprocess.run(["mpirun", *over, "-n", str(ranks), sys.executable, mpi_steps.__file__, str(path)], cwd=folder,
+    done = subprocess.run(["mpirun", *over, "-n", str(ranks), sys.executable, mpi_steps.__file__, str(path)],
+                          cwd=folder,
                           env=environment, capture_output=True, text=True, timeout=LIMIT)
     said = [{} for _ in steps]
     for rank in range(ranks):

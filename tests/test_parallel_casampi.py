@@ -1,4 +1,5 @@
-"""casampi's client has its servers do the task. Where casampi is installed, ranks can do nothing else: a file of its own."""
+"""casampi's client has its servers do the task. Where casampi is installed, ranks can do nothing else:
+a file of its own."""
 
 import importlib.util
 import json
@@ -36,7 +37,8 @@ def test_the_servers_of_casampi_make_the_image(tmp_path):
     (tmp_path / "script.py").write_text(SCRIPT)
     environment = dict(os.environ, OMPI_ALLOW_RUN_AS_ROOT="1", OMPI_ALLOW_RUN_AS_ROOT_CONFIRM="1", OMP_NUM_THREADS="1",
                        PYTHONPATH=os.pathsep.join([str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]))
-    done = subprocess.run(["mpirun", "--oversubscribe", "-n", "3", sys.executable, "script.py"], cwd=tmp_path, env=environment,
+    done = subprocess.run(["mpirun", "--oversubscribe", "-n", "3", sys.executable, "script.py"], cwd=tmp_path,
+                          env=environment,
                           capture_output=True, text=True, timeout=300)
     said = [json.loads(line) for line in done.stdout.split("\n") if line.startswith('["found"')]
     assert done.returncode == 0 and len(said) == 1, done.stderr[-2000:]

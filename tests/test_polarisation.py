@@ -24,7 +24,8 @@ def polarise(feed, name, noise=NOISE, seed=2):
     """Put the polarised sources, and noise, into DATA."""
     uvw, freq = column(name, "UVW"), column(name + "/SPECTRAL_WINDOW", "CHAN_FREQ", [0])[:, 0]
     i, q, u, v = (np.array(SKY[stokes]) for stokes in "IQUV")
-    brightness = (i + v, q + 1j * u, q - 1j * u, i - v) if feed == "circular" else (i + q, u + 1j * v, u - 1j * v, i - q)
+    brightness = (i + v, q + 1j * u, q - 1j * u, i - v) if feed == "circular" else (i + q, u + 1j * v, u - 1j * v,
+                                                                                    i - q)
     rng = np.random.default_rng(seed)
 
     def change(data):
@@ -42,8 +43,10 @@ def polarise(feed, name, noise=NOISE, seed=2):
 @pytest.fixture(scope="module")
 def observations(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ms")
-    return {feed: polarise(feed, simulate(folder / f"{feed}.ms", configuration="c", antennas=14, correlations=correlations,
-                                          noise=NOISE, scans=3, integration=20.0, spacing_seconds=5400.0, hour_angle=-2.0,
+    return {feed: polarise(feed,
+                           simulate(folder / f"{feed}.ms", configuration="c", antennas=14, correlations=correlations,
+                                          noise=NOISE, scans=3, integration=20.0, spacing_seconds=5400.0,
+                                    hour_angle=-2.0,
                                           spws=(("8.4GHz", "2MHz", 2),)))
             for feed, correlations in FEEDS.items()}
 
@@ -80,7 +83,8 @@ def test_weights_are_the_inverse_variance(observations, feed, stokes):
         edit(name, "DATA", lambda data: before)
     whitened = np.sqrt(data.weight) * data.vis
     tolerance = 4 / np.sqrt(2 * data.size)
-    assert whitened.real.std() == pytest.approx(1, abs=tolerance) and whitened.imag.std() == pytest.approx(1, abs=tolerance)
+    assert whitened.real.std() == pytest.approx(1, abs=tolerance) and whitened.imag.std() == pytest.approx(1,
+                                                                                                           abs=tolerance)
     hands = [1 / np.array(NOISE)[k] ** 2 for k in (0, 3)]
     np.testing.assert_allclose(data.imaging_weight, np.mean(hands), rtol=1e-5)
 
@@ -102,7 +106,8 @@ def test_sources_of_either_sign_are_found_and_the_noise_too(observations, feed, 
 
 
 @pytest.mark.parametrize("given, message", [
-    (dict(stokes="Q"), "positivity = True is not possible with stokes = 'Q', the image may be negative: set positivity = "
+    (dict(stokes="Q"),
+     "positivity = True is not possible with stokes = 'Q', the image may be negative: set positivity = "
                        "False"),
     (dict(stokes="U", positivity=False, savemodel="modelcolumn"),
      "savemodel = 'modelcolumn' is not possible with stokes = 'U'"),
@@ -121,7 +126,8 @@ def test_what_does_not_go_together_is_refused(observations, given, message):
     ("RL LR", "I", "RR and LL, or XX and YY, or one of them alone")])
 def test_missing_correlations_are_refused(tmp_path, correlations, stokes, right):
     name = simulate(tmp_path / "x.ms", correlations=correlations, antennas=4, scans=1)
-    with pytest.raises(ValueError, match=f"stokes = '{stokes}' cannot be formed from the correlations .*: it needs {right}"):
+    with pytest.raises(ValueError,
+                       match=f"stokes = '{stokes}' cannot be formed from the correlations .*: it needs {right}"):
         read_visibilities(Selection((name,), datacolumn="data"), stokes=stokes)
 
 

@@ -30,7 +30,8 @@ def _case(offset, flux=1.0, seed=0):
     model[model < 1e-6] = 0  # an interior-point solution only comes near its bounds
     scaled = MeasurementOperator(uv, 1.0, SHAPE, np.full(SAMPLES, 1 / NOISE), dtype=np.float64, eps=1e-10)
     ppd = SimpleNamespace(measurement=scaled, precond=np.ones(SAMPLES), vis=vis,
-                          offsets=np.array([0, 600, SAMPLES]), model=model, lowest=np.zeros(SHAPE), adjoint=scaled.adjoint, comm=SERIAL,
+                          offsets=np.array([0, 600, SAMPLES]), model=model, lowest=np.zeros(SHAPE),
+                          adjoint=scaled.adjoint, comm=SERIAL,
                           scratch_image=np.empty(SHAPE), scratch_vis=np.empty(SAMPLES, complex))
     return ppd, SimpleNamespace(noise_weights=np.ones(2)), matrix, data
 
@@ -62,7 +63,8 @@ def test_nothing_is_released_where_positive_pixels_hold_the_data(offset, flux):
 
 @pytest.mark.parametrize("beside, asks", [(0.001, False), (3.95, False), (4.05, True)])
 def test_a_source_nearby_explains_it(beside, asks):
-    """A negative source of 1, three pixels from one whose lobes of a quarter are too faint for it, or just bright enough."""
+    """A negative source of 1, three pixels from one whose lobes of a quarter are too faint for it,
+    or just bright enough."""
     ppd, bounds, *_ = _case(0.0, -1.0)
     ppd.model[...] = 0
     ppd.model[12, 13] = beside

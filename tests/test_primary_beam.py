@@ -27,7 +27,8 @@ def observations(tmp_path_factory):
                    spws=(("8.4GHz", "2MHz", 1),), sky=[(1.0, 100 * ARCSEC, -60 * ARCSEC)])
     places = ALMA[:, None] + 40 * np.random.default_rng(1).standard_normal((3, 10))
     alma = simulate(folder / "alma.ms", configuration=places, telescope="ALMA", correlations="XX YY", fields=(SOUTH,),
-                    spws=(("230GHz", "10MHz", 2),), scans=1, integration=20.0, noise=0.02, sky=[(1.0, 5 * ARCSEC, 3 * ARCSEC)])
+                    spws=(("230GHz", "10MHz", 2),), scans=1, integration=20.0, noise=0.02,
+                    sky=[(1.0, 5 * ARCSEC, 3 * ARCSEC)])
     edit(alma + "/ANTENNA", "DISH_DIAMETER", lambda old: np.full_like(old, 12.0))
     return {"vla": vla, "alma": alma}
 
@@ -37,7 +38,8 @@ def contents(name):
     ia = casatools.image()
     ia.open(name)
     try:
-        return (ia.getchunk()[:, :, 0, 0], ia.getchunk(getmask=True)[:, :, 0, 0], ia.maskhandler("get"), ia.brightnessunit(),
+        return (ia.getchunk()[:, :, 0, 0], ia.getchunk(getmask=True)[:, :, 0, 0], ia.maskhandler("get"),
+                ia.brightnessunit(),
                 ia.restoringbeam())
     finally:
         ia.close()
@@ -49,7 +51,8 @@ def test_beam_masks_and_correction_are_tcleans(observations, telescope, centre, 
     """Of the same images, with the centre of the image at the field's, or elsewhere."""
     import casatasks
 
-    common = dict(vis=observations[telescope], niter=0, datacolumn="data", pbcor=True, pblimit=pblimit, **GRIDS[telescope])
+    common = dict(vis=observations[telescope], niter=0, datacolumn="data", pbcor=True, pblimit=pblimit,
+                  **GRIDS[telescope])
     if centre:
         common["phasecenter"] = CENTRES[telescope]
     tsara(imagename="ours", **common)
@@ -86,7 +89,8 @@ def test_corrected_images_are_what_was_seen_over_the_beam(observations):
 
 
 def test_beam_is_that_of_a_dish(observations):
-    """ALMA's beam is the Airy pattern of 10.7 m with a blockage of 0.75 m, to the percent that CASA's table of it is."""
+    """ALMA's beam is the Airy pattern of 10.7 m with a blockage of 0.75 m,
+    to the percent that CASA's table of it is."""
     tsara(vis=observations["alma"], imagename="x", niter=0, datacolumn="data", pblimit=0.05, **GRIDS["alma"])
     beam, good, *_ = contents("x.pb")
     x, y = np.indices(beam.shape)

@@ -81,7 +81,8 @@ def test_the_dual_update_is_moreaus_complement_of_the_projection():
         kernels.data_step(*pairs, precond, pieces, np.array([multiplier]), 1.0, norms_sq, worker, 2)
     np.testing.assert_allclose(dual, expected, rtol=1e-8)
     np.testing.assert_allclose(anchor, model, rtol=1e-12)  # that of z + ρ(x − z), ρ = 1
-    np.testing.assert_allclose(norms_sq, [np.linalg.norm((centre - model)[part]) ** 2 for part in (slice(50), slice(50, 80))])
+    np.testing.assert_allclose(norms_sq,
+                               [np.linalg.norm((centre - model)[part]) ** 2 for part in (slice(50), slice(50, 80))])
 
 
 def test_float32_projection_is_as_exact_as_single_precision_allows():

@@ -10,7 +10,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 LARGEST = 2**20  # bytes
-OF_TABLES = re.compile(r"(^|/)(table\.(dat|info|lock)|table\.f\d+\w*|TempLattice\w*|TempImage\w*)(/|$)|\.(ms|image|model|psf)(/|$)")
+OF_TABLES = re.compile(r"(^|/)(table\.(dat|info|lock)|table\.f\d+\w*|TempLattice\w*|TempImage\w*)(/|$)"
+                       r"|\.(ms|image|model|psf)(/|$)")
 
 
 def looks_wrong(name, size):
@@ -23,15 +24,18 @@ def looks_wrong(name, size):
 def test_tracked_files_are_small_and_no_tables():
     if not shutil.which("git") or not (ROOT / ".git").exists():
         pytest.skip("no git checkout")
-    names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
+    names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True,
+                           check=True).stdout.split("\0")
     names = [name for name in names if name and (ROOT / name).exists()]
     assert len(names) > 100
     assert not [wrong for name in names if (wrong := looks_wrong(name, (ROOT / name).stat().st_size))]
 
 
 @pytest.mark.parametrize("name, size, wrong", [
-    ("docs/images/a.png", 2**20 + 1, True), ("TempLattice17100_184/table.f0", 100, True), ("x/y.ms/table.dat", 10, True),
-    ("benchmarks/a.image/table.info", 10, True), ("benchmarks/tables.py", 100, False), ("casa_sara/casa/images/image_files.py", 100, False),
+    ("docs/images/a.png", 2**20 + 1, True), ("TempLattice17100_184/table.f0", 100, True),
+    ("x/y.ms/table.dat", 10, True),
+    ("benchmarks/a.image/table.info", 10, True), ("benchmarks/tables.py", 100, False),
+    ("casa_sara/casa/images/image_files.py", 100, False),
 ])
 def test_what_looks_wrong_is_seen(name, size, wrong):
     assert bool(looks_wrong(name, size)) == wrong
@@ -48,7 +52,8 @@ def test_every_dependency_has_its_licence_in_the_docs():
 
 
 def test_licence_is_that_of_the_metadata():
-    assert "BSD 3-Clause" in (ROOT / "LICENSE").read_text() and "the casa_sara authors" in (ROOT / "LICENSE").read_text()
+    assert "BSD 3-Clause" in (ROOT / "LICENSE").read_text() and "the casa_sara authors" in (ROOT
+                                                                                            / "LICENSE").read_text()
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
     assert config["metadata"]["license"] == "BSD-3-Clause" and "the casa_sara authors" == config["metadata"]["author"]

@@ -91,7 +91,8 @@ print(json.dumps([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child i
 
 @pytest.fixture(scope="module")
 def vis(tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("ms") / "c.ms", configuration="c", antennas=12, sky=SKY, noise=0.05, scans=2,
+    return simulate(tmp_path_factory.mktemp("ms") / "c.ms", configuration="c", antennas=12, sky=SKY, noise=0.05,
+                    scans=2,
                     integration=20.0, spacing_seconds=5400.0, hour_angle=-2.5, seed=4)
 
 
@@ -107,7 +108,8 @@ def ended(vis, tmp_path_factory):
     moments = KILLED | {name: ("iteration", 77) for name in STOPPED}
     folders = [tmp_path_factory.mktemp(name) for name in moments]
     cases = [[str(folder), dict(vis=vis, imagename=str(folder / "source"), **GRID), place, moment,
-              int(STOPPED.get(name, signal.SIGKILL))] for folder, (name, (place, moment)) in zip(folders, moments.items())]
+              int(STOPPED.get(name, signal.SIGKILL))]
+             for folder, (name, (place, moment)) in zip(folders, moments.items())]
     done = subprocess.run([sys.executable, "-c", SCRIPT], input=json.dumps(cases), text=True, capture_output=True,
                           timeout=300, cwd=folders[0].parent, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True)
     statuses = json.loads(done.stdout.splitlines()[-1])
@@ -134,7 +136,8 @@ def test_killed_at_any_moment_it_goes_on_to_the_same_image(uninterrupted, ended,
     folder, status, output = ended[moment]
     assert status == -signal.SIGKILL, output
     place, count = KILLED[moment]
-    left = {"source.lock"} | (set() if moment in TOO_EARLY else {"source.checkpoint"})  # a killed run's lock locks nothing
+    # a killed run's lock locks nothing
+    left = {"source.lock"} | (set() if moment in TOO_EARLY else {"source.checkpoint"})
     left |= {"source.checkpoint.new"} if place == "checkpoint" else set()
     assert names_in(folder) - left == set() or place == "product"
     assert left <= names_in(folder)
@@ -187,7 +190,8 @@ def stopped(vis, tmp_path, monkeypatch):
     return name
 
 
-def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, uninterrupted, tmp_path_factory, monkeypatch):
+def test_what_does_not_belong_is_refused_and_nothing_touched(vis, stopped, uninterrupted, tmp_path_factory,
+                                                             monkeypatch):
     path = Path(stopped + ".checkpoint")
     good = path.read_bytes()
     before = _hashes(path.parent)
@@ -234,7 +238,8 @@ def test_a_second_ctrl_c_aborts_at_once(vis, tmp_path, monkeypatch):
 
 def test_ctrl_c_before_the_first_iteration_leaves_everything(stopped, vis, monkeypatch):
     before = _hashes(Path(stopped).parent)
-    monkeypatch.setattr("casa_sara.reconstruction.problem.nnls", lambda *args, **more: signal.raise_signal(signal.SIGINT))
+    monkeypatch.setattr("casa_sara.reconstruction.problem.nnls", lambda *args,
+                        **more: signal.raise_signal(signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         tsara(vis=vis, imagename=stopped, overwrite=True, **GRID)
     assert _hashes(Path(stopped).parent) == before

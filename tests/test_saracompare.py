@@ -118,7 +118,8 @@ def test_measures_are_those_of_casa_and_numpy(tmp_path):
     assert mine["natural"]["sigma"] == pytest.approx(sigma, rel=1e-6)
     assert mine["natural"]["dr"] == pytest.approx(restored.max() / sigma, rel=1e-6)
     # and by astropy's with radio-beam
-    kernel = Beam(3 * units.arcsec, 2 * units.arcsec, 30 * units.deg).as_kernel(0.5 * units.arcsec, x_size=99, y_size=99)
+    kernel = Beam(3 * units.arcsec, 2 * units.arcsec, 30 * units.deg).as_kernel(0.5 * units.arcsec, x_size=99,
+                                                                                y_size=99)
     kernel = kernel.array / kernel.array.sum() * np.pi * 6 / (4 * np.log(2) * 0.25)
     theirs = convolve_fft(model.T, kernel, boundary="fill", normalize_kernel=False).T + residual
     assert mine["natural"]["dr"] == pytest.approx(theirs.max() / sigma, rel=1e-6)
@@ -184,7 +185,8 @@ def test_a_point_in_galactic_coordinates_is_found_again(tmp_path):
     found = saracompare(models=[one, two])
     assert found["products"]["two"]["flux_jy"] == pytest.approx(1.0, rel=1e-6)
     assert found["similarity"]["natural"]["one|two"] > 35
-    with pytest.raises(ValueError, match="models: '.*two.model' is in GALACTIC: the first should be in J2000, ICRS or B1950"):
+    with pytest.raises(ValueError,
+                       match="models: '.*two.model' is in GALACTIC: the first should be in J2000, ICRS or B1950"):
         saracompare(models=[two, one])
 
 
@@ -567,7 +569,8 @@ def test_an_image_without_a_beam_is_refused(tmp_path, vis):
     with pytest.raises(ValueError, match="none of them has an .image, .residual or .psf with a beam"):
         saracompare(models=[one, one])
     write(tmp_path / "one.residual", sky(), "Jy/beam")
-    with pytest.raises(ValueError, match="'.*one.residual' has no beam, and there is no image or PSF with a beam: give vis"):
+    with pytest.raises(ValueError,
+                       match="'.*one.residual' has no beam, and there is no image or PSF with a beam: give vis"):
         saracompare(models=[one, one])
     assert saracompare(models=[one, one], vis=vis, datacolumn="data")["products"]["one"]["natural"]["dr"] > 10
     write(tmp_path / "one.psf", sky(), "", beam=BEAM)
@@ -644,7 +647,8 @@ def test_the_task_in_the_casa_shell(tmp_path):
     (tmp_path / "startup.py").write_text("from casa_sara.gotasks import *\n")
     flags = "--nogui --nologger --nologfile --agg --colors NoColor --cachedir cache"
     environment = os.environ | {"HOME": str(tmp_path), "COLUMNS": "110", "PYTHONPATH": str(Path(__file__).parents[1])}
-    run = subprocess.run([sys.executable, "-m", "casashell", *flags.split(), "--startupfile", "startup.py", "-c", "script.py"],
+    run = subprocess.run([sys.executable, "-m", "casashell", *flags.split(), "--startupfile", "startup.py", "-c",
+                          "script.py"],
                          cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert (tmp_path / "records.json").exists(), run.stdout + run.stderr
     shown, _, again, went, names, refused, tasks = json.loads((tmp_path / "records.json").read_text())

@@ -233,7 +233,8 @@ def test_the_largest_sidelobe_of_a_point_spread_function_is_found(level, expecte
     assert MatchedFilter(50 * psf).sidelobe == pytest.approx(expected, rel=1e-4)
 
 
-@pytest.mark.parametrize("image, kernel", [((21, 18), (8, 5)), ((9, 9), (9, 9)), ((12, 7), (1, 4)), ((1, 6), (1, 1)), ((5, 5), (1, 1))])
+@pytest.mark.parametrize("image, kernel",
+                         [((21, 18), (8, 5)), ((9, 9), (9, 9)), ((12, 7), (1, 4)), ((1, 6), (1, 1)), ((5, 5), (1, 1))])
 def test_convolution_is_that_of_scipy(image, kernel):
     rng = np.random.default_rng(8)
     a, b = rng.standard_normal(image), rng.standard_normal(kernel)
@@ -473,7 +474,8 @@ def test_a_point_that_holds_too_much_flux_is_none(sums, filter_):
 
 @pytest.mark.parametrize("x, y", [(0, 0), (71, 63), (1, 30), (36, 61), (0, 63)])
 def test_at_the_edge_nothing_is_lost(sums, filter_, x, y):
-    """Where the pixels of a point would reach over the edge the support stays; 4 pixels from it there is enough to tell."""
+    """Where the pixels of a point would reach over the edge the support stays;
+    4 pixels from it there is enough to tell."""
     vis = of_snr(sums, 30, (1, x, y, 0))
     before, support, points = narrowed(sums, filter_, vis, places=[(x, y)])
     assert support[x, y] and not len(points)
@@ -551,7 +553,8 @@ def test_points_come_and_go_with_the_support():
             before = ppd.model.copy()
             ppd.step()
             held = ppd.model[points.x, points.y]
-            np.testing.assert_allclose(held, held.sum(axis=1, keepdims=True) * points.shapes, atol=1e-6 * ppd.model.max())
+            np.testing.assert_allclose(held, held.sum(axis=1, keepdims=True) * points.shapes,
+                                       atol=1e-6 * ppd.model.max())
             change = np.linalg.norm(ppd.model - before) / np.linalg.norm(ppd.model)
             assert ppd.rel_change == pytest.approx(change, rel=1e-4)
             assert (ppd.model_flux, ppd.model_max) == pytest.approx((ppd.model.sum(dtype=float), ppd.model.max()))
@@ -604,7 +607,8 @@ def test_islands_are_measured():
 
 @pytest.mark.parametrize("place", [(14.3, 20.7), (10.5, 30.0), (22.0, 9.0)])
 def test_the_island_of_a_point_between_pixels_is_a_point(sums, place):
-    """At its place and without extent, though 36 pixels of both signs hold it; where both signs cancel, the modulus tells."""
+    """At its place and without extent, though 36 pixels of both signs hold it; where both signs cancel,
+    the modulus tells."""
     point = PointSources([place])
     model = np.zeros(sums.shape)
     model[point.x, point.y] = 0.3 * point.shapes
@@ -784,7 +788,8 @@ def test_a_solution_has_the_weights_of_its_support(significance):
     np.testing.assert_array_equal(ppd.l1_weights, first)
     sums, again, bounds = problem()
     again.vis[:], again.l2_step = ppd.vis, ppd.l2_step
-    run_algorithm_2(again, bounds, Schedule(niter=61, significance=significance))  # one iteration after the first of them
+    # one iteration after the first of them
+    run_algorithm_2(again, bounds, Schedule(niter=61, significance=significance))
     ratio = again.l1_weights[0, 24, 20] / again.l1_weights[0, 40, 5]
     assert (again.l1_weights[1:].min() < 0.13) == (significance > 0)
     assert (ratio < 0.26) == (significance > 0)

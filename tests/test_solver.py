@@ -39,7 +39,8 @@ def _slsqp_minimiser(problem, bounds):
         rows = []
         for a, b in blocks:
             part = problem.measurement.matrix[a:b]
-            rows.append(np.concatenate([2 * (part.conj().T @ (problem.vis[a:b] - part @ z[:size])).real, np.zeros(coefs)]))
+            rows.append(np.concatenate([2 * (part.conj().T @ (problem.vis[a:b] - part @ z[:size])).real,
+                                        np.zeros(coefs)]))
         return np.array(rows)
 
     start = np.concatenate([problem.truth.ravel(), np.abs(matrix @ problem.truth.ravel())])

@@ -89,7 +89,8 @@ def vis(tmp_path_factory):
     def coloured(data):
         spectrum = (freqs[len(windows)] / REFERENCE) ** INDEX
         windows.append(1)
-        return data * spectrum[:, None] + 0.01 * (rng.standard_normal(data.shape) + 1j * rng.standard_normal(data.shape))
+        return data * spectrum[:,
+                               None] + 0.01 * (rng.standard_normal(data.shape) + 1j * rng.standard_normal(data.shape))
 
     window = column(name, "DATA_DESC_ID")
     tb = casatools.table()
@@ -163,7 +164,8 @@ def test_image_of_indices(run, vis, tmp_path):
     tsara(vis=vis, imagename=name, spectralindex=alpha(str(tmp_path / "a.alpha"), values, mask, run), **GRID)
     np.testing.assert_allclose(fluxes(name), fluxes(run[1]), rtol=2e-3)
     plane = read_sky_image(run[1] + ".model", "models", None).plane
-    spectrum = with_spectrum(ImageGrid((64, 64), (PIXEL, PIXEL), spectralindex=str(tmp_path / "a.alpha")), plane).spectrum
+    spectrum = with_spectrum(ImageGrid((64, 64), (PIXEL, PIXEL), spectralindex=str(tmp_path / "a.alpha")),
+                             plane).spectrum
     assert spectrum.reference_hz == REFERENCE and spectrum.index[0, 0] == pytest.approx(0.5)
     assert np.all(spectrum.index.reshape(-1)[1:] == np.float32(INDEX))
     said = tsara(vis=vis, imagename=name, spectralindex=str(tmp_path / "a.alpha"), dryrun=True, **GRID)["forecast"]

@@ -23,7 +23,8 @@ BOX = "circle[[48pix,30pix],8pix]"
 
 @pytest.fixture(scope="module")
 def vis(tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("ms") / "c.ms", configuration="c", antennas=14, sky=[INSIDE, OUTSIDE], noise=0.05,
+    return simulate(tmp_path_factory.mktemp("ms") / "c.ms", configuration="c", antennas=14, sky=[INSIDE, OUTSIDE],
+                    noise=0.05,
                     scans=2, integration=20.0, spacing_seconds=5400.0, spws=(("8.4GHz", "2MHz", 2),), seed=4)
 
 
@@ -31,7 +32,8 @@ def tcleans_mask(vis, **mask):
     """The mask that tclean makes."""
     import casatasks
 
-    casatasks.tclean(vis=vis, imagename="theirs", imsize=GRID["imsize"], cell=GRID["cell"], datacolumn="data", niter=1, **mask)
+    casatasks.tclean(vis=vis, imagename="theirs", imsize=GRID["imsize"], cell=GRID["cell"], datacolumn="data", niter=1,
+                     **mask)
     return pixels("theirs.mask")
 
 
@@ -51,7 +53,8 @@ def test_mask_is_tcleans_and_the_model_is_zero_outside(vis):
 
 def test_what_is_outside_stays_out_is_pointed_out_and_raises_the_noise(vis):
     """0.4 Jy that the mask keeps out add their power to what is found as noise: √(1 + 0.4²w/2), w the weight."""
-    result = tsara(vis=vis, imagename="x", niter=200, mask="circle[[48pix,30pix],2pix]", **(GRID | dict(wavelets=["dirac"])))
+    result = tsara(vis=vis, imagename="x", niter=200, mask="circle[[48pix,30pix],2pix]",
+                   **(GRID | dict(wavelets=["dirac"])))
     model = pixels("x.model")
     assert not model[pixels("x.mask") == 0].any()
     assert model.sum() == pytest.approx(1.0, rel=0.1)
@@ -102,7 +105,8 @@ def test_primary_beam_mask_is_tcleans(vis, limit, region):
     (dict(mask="circle[[400pix,400pix],10pix]"), r"mask = 'circle.*' selects no pixel: should be a CRTF region"),
     (dict(mask=[BOX, "rubbish[["]), r"mask = 'rubbish\[\[' selects no pixel"),
     (dict(mask="circle[[48pix,30pix],3pix]", pbmask=1.0), r"mask = 'circle.*', pbmask = 1 selects no pixel"),
-    (dict(usemask="pb", pbmask=0.9, phasecenter="J2000 19h59m50s +40d44m02s"), "usemask = 'pb', pbmask = 0.9: the primary beam"),
+    (dict(usemask="pb", pbmask=0.9, phasecenter="J2000 19h59m50s +40d44m02s"),
+     "usemask = 'pb', pbmask = 0.9: the primary beam"),
     (dict(pbmask=0.3), "pbmask = 0.3 has no effect without a mask"),
     (dict(usemask="pb", mask=BOX), "mask = .* has no effect with usemask = 'pb'"),
 ])

@@ -50,7 +50,8 @@ EXCEPTIONS = {
     ("uvtaper", "default"): "[] as tclean's own in the shell; in Python tclean has ['']; both mean none",
     ("usemask", "allowed"): NARROWER,
     ("weighting", "allowed"): NARROWER,
-    ("wprojplanes", "default"): "tclean's 1 leaves the w-term out of gridder='wproject'; here -1, as no number is needed",
+    ("wprojplanes",
+     "default"): "tclean's 1 leaves the w-term out of gridder='wproject'; here -1, as no number is needed",
     ("wprojplanes", "range"): SURER,
     ("veltype", "allowed"): NARROWER,
     ("width", "types"): "a number or a quantity; tclean's variant lets anything through",
@@ -262,7 +263,8 @@ def test_python_and_numpy_values_are_taken(received):
         ({"robust": "1", "weighting": "briggs"}, "robust = '1': should be a number"),
         ({"reltol": float("nan")}, "reltol = nan: should be a number"),
         ({"regscale": float("inf")}, "regscale = inf: should be a number"),
-        ({"l2bound": [1, -1], "databound": "fixed"}, r"l2bound = \[1, -1\]: should be a list of numbers, at least 1e-06"),
+        ({"l2bound": [1, -1], "databound": "fixed"},
+         r"l2bound = \[1, -1\]: should be a list of numbers, at least 1e-06"),
         ({"imsize": [64, 0]}, r"imsize = \[64, 0\]: should be an integer or a list of integers, at least 1"),
         ({"imsize": "64"}, "imsize = '64': should be an integer or a list of integers"),
         ({"weighting": "Briggs"}, "weighting = 'Briggs': should be a string out of 'natural', 'uniform', 'briggs'"),
@@ -312,7 +314,8 @@ def closing_and_opening(parameter):
 )
 def test_sub_parameter_that_would_be_ignored_is_refused(received, parameter):
     closing, opening = closing_and_opening(parameter)
-    other = {"bool": True, "string": "x", "stringVec": ["x"], "double": 0.25, "doubleVec": [0.25], "int": 7}[parameter.types[0]]
+    other = {"bool": True, "string": "x", "stringVec": ["x"], "double": 0.25, "doubleVec": [0.25],
+             "int": 7}[parameter.types[0]]
     other = parameter.allowed[-1] if parameter.allowed else other
     message = f"{parameter.name} = .* has no effect with {parameter.opener} = .*: set {parameter.opener} to"
     with pytest.raises(ValueError, match=message):

@@ -28,7 +28,8 @@ GRID = dict(imsize=128, cell="0.5arcsec", datacolumn="data")
 
 @pytest.fixture(scope="module")
 def vis(tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("ms") / "c.ms", configuration="c", antennas=18, sky=SKY, noise=0.05, scans=4,
+    return simulate(tmp_path_factory.mktemp("ms") / "c.ms", configuration="c", antennas=18, sky=SKY, noise=0.05,
+                    scans=4,
                     integration=20.0, spacing_seconds=5400.0, hour_angle=-2.5, seed=4)
 
 
@@ -48,7 +49,8 @@ def copy(vis, tmp_path):
 
 
 def _hashes(folder):
-    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in Path(folder).rglob("*") if path.is_file()}
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in Path(folder).rglob("*") if path.is_file()}
 
 
 def test_the_model_is_the_sky(run):
@@ -67,7 +69,8 @@ def test_products_are_there_whole_and_finite(run):
     _, name, *_ = run
     for product in PRODUCTS:
         assert np.isfinite(pixels(f"{name}.{product}")).all(), product
-    assert sorted(path.name for path in Path(name).parent.iterdir()) == sorted([RECORD, *(f"source.{p}" for p in PRODUCTS)])
+    assert sorted(path.name
+                  for path in Path(name).parent.iterdir()) == sorted([RECORD, *(f"source.{p}" for p in PRODUCTS)])
     assert pixels(name + ".psf").max() == pytest.approx(1.0, abs=1e-5)
     # restored image: the model in the beam and the residual; noise of the residual is the thermal one
     residual = pixels(name + ".residual")
@@ -81,7 +84,8 @@ def test_the_measurement_set_is_untouched(run):
 
 def test_the_dictionary_is_tcleans_with_a_sara_record(run):
     result, *_ = run
-    assert {"iterdone", "niter", "nmajordone", "stopcode", "stopDescription", "summarymajor", "summaryminor"} <= set(result)
+    assert {"iterdone", "niter", "nmajordone", "stopcode", "stopDescription", "summarymajor",
+            "summaryminor"} <= set(result)
     assert set(result["summaryminor"][0][0][0]) >= {"iterDone", "peakRes", "modelFlux"}
     sara = result["sara"]
     assert [block["scans"] for block in sara["blocks"]] == [[1], [2], [3], [4]]
@@ -220,7 +224,8 @@ def test_the_model_column_holds_the_models_visibilities(copy, tmp_path):
 
 def test_several_measurement_sets_and_odd_sizes(vis, copy, tmp_path):
     name = str(tmp_path / "both")
-    result = tsara(vis=[vis, str(copy)], imagename=name, imsize=[121, 250], cell=["0.5arcsec", "0.25arcsec"], datacolumn="data")
+    result = tsara(vis=[vis, str(copy)], imagename=name, imsize=[121, 250], cell=["0.5arcsec", "0.25arcsec"],
+                   datacolumn="data")
     assert pixels(name + ".model").shape == (121, 250)
     # the brighter point source: pixels 60 − l/cell, 125 + m/cell
     assert pixels(name + ".model")[80:89, 145:162].sum() == pytest.approx(1.0, rel=0.05)
@@ -340,7 +345,8 @@ def test_wild_samples_are_left_out_named_and_counted(run, vis, copy, tmp_path):
     assert np.linalg.norm(model - clean) < 1e-3 * np.linalg.norm(clean)
     residual, before = (pixels(name + ".residual") for name in (str(tmp_path / "wild"), run[1]))
     assert residual.std() < 1.1 * before.std()
-    assert sum(block["samples"] for block in sara["blocks"]) == run[0]["sara"]["visibilities"] - 2 == sara["visibilities"]
+    assert sum(block["samples"]
+               for block in sara["blocks"]) == run[0]["sara"]["visibilities"] - 2 == sara["visibilities"]
 
 
 def test_a_report_of_the_run(vis, tmp_path):

@@ -63,7 +63,8 @@ def test_cell_and_blocks(tmp_path):
     cells, refusal, blocks, truth = module.main(tmp_path)
     assert [run.snr_beam for run in cells.values()] == pytest.approx([44.1, 44.1], abs=0.7)
     assert [run.snr_half for run in cells.values()] == pytest.approx([24.9, 25.5], abs=0.5)
-    assert refusal == "cell=0.4arcsec is too large for the longest baseline, 306.8 klambda: use at most cell=0.3358arcsec"
+    assert refusal == ("cell=0.4arcsec is too large for the longest baseline, 306.8 klambda: "
+                       "use at most cell=0.3358arcsec")
     found = [block["noise_found"] for block in blocks[0].blocks]
     assert found == pytest.approx([1, 1, 1, 10, 10, 10], rel=0.06)
     assert [block["noise_found"] for block in blocks[1].blocks] == pytest.approx([7.07], rel=0.05)

@@ -129,7 +129,8 @@ def test_impossible_number_of_blocks(blocks):
 @settings(max_examples=60, deadline=None)
 @given(
     st.lists(
-        st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(1, 4), st.integers(0, 200_000), st.integers(1, 250)),
+        st.tuples(st.integers(0, 2), st.integers(0, 1), st.integers(1, 4), st.integers(0, 200_000),
+                  st.integers(1, 250)),
         min_size=1,
         max_size=8,
     ),

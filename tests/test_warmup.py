@@ -1,4 +1,5 @@
-"""Kernels that a thread loads before they are needed, all of them and none again; and compiles where they are missing."""
+"""Kernels that a thread loads before they are needed, all of them and none again;
+and compiles where they are missing."""
 
 import os
 import shutil
@@ -16,7 +17,8 @@ from casa_sara.reconstruction.compile_cache import use_every_kernel
 
 def loaded():
     return {(one.py_func.__module__, one.py_func.__name__): len(one.signatures)
-            for one in gc.get_objects() if isinstance(one, Dispatcher) and one.py_func.__module__.startswith("casa_sara")}
+            for one in gc.get_objects() if isinstance(one, Dispatcher)
+            and one.py_func.__module__.startswith("casa_sara")}
 
 if sys.argv[1] == "warm":
     use_every_kernel()
@@ -35,8 +37,9 @@ table = RowTable(**{name: zeros for name in RowTable.__dataclass_fields__}
 data = Visibilities(
     vis=(1 + 0.1 * rng.standard_normal(rows) + 0.1j * rng.standard_normal(rows)).astype(np.complex64),
     weight=np.full(rows, 100, np.float32), imaging_weight=np.full(rows, 100, np.float32),
-    uvw=rng.normal(size=(3, rows)) * 1e4, row=np.arange(rows, dtype=np.int32), chan=np.zeros(rows, np.int16), rows=table,
-    ms_names=("a.ms",), notes=[], phase_center={}, freq_range_hz=(1e9, 2e9), spws={0: (0,)}, observatory="VLA", dropped={})
+    uvw=rng.normal(size=(3, rows)) * 1e4, row=np.arange(rows, dtype=np.int32), chan=np.zeros(rows, np.int16),
+    rows=table, ms_names=("a.ms",), notes=[], phase_center={}, freq_range_hz=(1e9, 2e9), spws={0: (0,)},
+    observatory="VLA", dropped={})
 found = reconstruct(Samples(data, np.array([0, 30, rows]), np.ones(rows, np.float32)),
                     ImageGrid((32, 48), (5e-6, 5e-6)), SolverOptions(niter=70, nreweights=2))
 assert found.record.iteration[-1] >= 60

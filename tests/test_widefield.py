@@ -148,7 +148,8 @@ def test_an_image_wider_than_the_sky_is_refused():
 
 @pytest.fixture(scope="module")
 def vis(tmp_path_factory):
-    return simulate(tmp_path_factory.mktemp("ms") / "far.ms", antennas=14, sky=SKY, noise=0.02, scans=4, integration=20.0,
+    return simulate(tmp_path_factory.mktemp("ms") / "far.ms", antennas=14, sky=SKY, noise=0.02, scans=4,
+                    integration=20.0,
                     spacing_seconds=5400.0, hour_angle=-4.0, spws=(("74MHz", "0.5MHz", 2),), seed=1)
 
 
@@ -234,7 +235,8 @@ def test_model_column_has_the_phases_of_casas_component_predictor(vis, tmp_path)
     ia.putchunk(np.zeros(ia.shape()))
     ia.putchunk(np.full((1, 1, 1, 1), 2.0), blc=[*PLACE, 0, 0])
     ia.close()
-    tsara(vis=name, imagename=str(tmp_path / "one"), gridder="wproject", niter=0, restart=True, savemodel="modelcolumn", **GRID)
+    tsara(vis=name, imagename=str(tmp_path / "one"), gridder="wproject", niter=0, restart=True, savemodel="modelcolumn",
+          **GRID)
     ours = column(name, "MODEL_DATA")
     cl, me, im = casatools.componentlist(), casatools.measures(), casatools.imager()
     offset, angle = (f"{value!r}rad" for value in (float(np.arcsin(np.hypot(*FAR))), float(np.arctan2(*FAR))))
@@ -257,7 +259,8 @@ def test_comparison_takes_the_w_term_into_the_residuals(run, flat, vis):
     comparison = compare_images(Comparing(names, ("wide", "flat")), selection)
     chi_square = {name: comparison.measures["products"][name]["natural"]["chi_square"] for name in ("wide", "flat")}
     assert max(chi_square["wide"]) < 1.3 and max(chi_square["flat"]) > 10
-    assert any("with the w-term, which changes phases by up to 7.1 rad in this image; 'flat' was imaged without it" in note
+    assert any("with the w-term, which changes phases by up to 7.1 rad in this image; 'flat' was imaged without it"
+               in note
                for note in comparison.notes)
     alone = compare_images(Comparing(names[1:]), selection, single=True)
     assert not any("with the w-term" in note for note in alone.notes)

@@ -5,8 +5,8 @@ subparam, mustexist and required (required: may not be left empty); its <shortde
 <description>, <type> (for type="any"), <value>, and <allowed> of kind enum or range; <constraints>
 with <when>, <equals> or <notequals>, <default>; <returns> and <example>, which
 taskexample.py describes. Anything else is an error, and so is a sub-parameter that nothing opens, that two
-parameters open or that does not stand right behind its opener, a missing or wrong default, a constraint on an unknown value, or a constraint's
-default that differs from the parameter's own.
+parameters open or that does not stand right behind its opener, a missing or wrong default, a constraint on an unknown
+value, or a constraint's default that differs from the parameter's own.
 """
 
 from __future__ import annotations

@@ -79,7 +79,8 @@ class _{task.name}(ShellTask):
 
 def parameter_tables(tasks: list[Task]) -> str:
     """Return the module with the parameters of all tasks."""
-    head = f'"""The parameters of the tasks. {HEADER.format("*")}"""\n\nfrom casa_sara.private.validation import Parameter\n'
+    head = (f'"""The parameters of the tasks. {HEADER.format("*")}"""\n\n'
+            "from casa_sara.private.validation import Parameter\n")
     tables = []
     for task in tasks:
         parameters = "".join(f"    {_parameter(param)},\n" for param in task.params)

@@ -84,8 +84,8 @@ def _blocks(measured):
                              "most": float(chi.max())}
     columns = [("median", "median", ""), ("least", "least", ""), ("most", "most", ""), ("blocks", "blocks", "")]
     caption = (
-        "Reduced chi-square of each block: the sum of w|r|² of its residual visibilities over twice their number. It is 1 "
-        "where the residual is noise as given by the MS weights, and less where the model has fitted noise."
+        "Reduced chi-square of each block: the sum of w|r|² of its residual visibilities over twice their number. It "
+        "is 1 where the residual is noise as given by the MS weights, and less where the model has fitted noise."
     )
     return build("χ² of the blocks", columns, entries, caption)
 
@@ -151,10 +151,10 @@ def _injected(measured, beams):
                *((name, "width", f"{name} beams") for name in widths)]
     caption = (
         "Point sources put into the visibilities, which tsara then imaged without and with them. Measured is "
-        f"the difference of the two models, in a circle of {number(min(widths.values()), 3)}″ (the finest beam's width) "
-        "around the source. Width: of the circle that holds half of the flux, which is the full width at half maximum "
-        "of a Gaussian. A restored image has the width of its beam by definition; other imagers were not run again, so "
-        "the width of a point source in their models is not known."
+        f"the difference of the two models, in a circle of {number(min(widths.values()), 3)}″ (the finest beam's "
+        "width) around the source. Width: of the circle that holds half of the flux, which is the full width at half "
+        "maximum of a Gaussian. A restored image has the width of its beam by definition; other imagers were not run "
+        "again, so the width of a point source in their models is not known."
     )
     return build("Injected point sources: resolution reached", columns, rows, caption)
 

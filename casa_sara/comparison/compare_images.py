@@ -42,8 +42,8 @@ VERSIONS = ("casatools", "numpy", "scipy", "astropy", "regions")
 def compare_images(request: Comparing, selection: Selection | None = None, single: bool = False) -> Comparison:
     """Compare the images that several imagers made of one sky.
 
-    The pixels of the first model are the common grid; if it is turned, mirrored or not in SIN projection, pixels of this
-    size with x to the west and y to the north. With a selection of visibilities, the residual of every model is
+    The pixels of the first model are the common grid; if it is turned, mirrored or not in SIN projection, pixels of
+    this size with x to the west and y to the north. With a selection of visibilities, the residual of every model is
     made of them with one operator and one set of weights; without, the residual images beside the models are used.
 
     Parameters
@@ -65,7 +65,8 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     sets = _read(request, selection is None, 1 if single else 2)
     first, notes = sets[0].model, []
     if first.plane.frame not in RADESYS:
-        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or B1950")
+        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or "
+                         "B1950")
     if RADESYS[first.plane.frame] == "FK4":
         notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
     frames = read_frames(request.frames, first.plane.upright())
@@ -205,7 +206,8 @@ def _support(request, plane, frame, models, truth, beam, notes):
                          "part of it, above 0.5 in a mask image")
     outside = max(model[~support].max() / model.max() for model in models)
     if outside > 0.5:
-        notes.append(f"support = '{text}' excludes a pixel with {100 * outside:.2g} % of the peak of a model: please check it")
+        notes.append(f"support = '{text}' excludes a pixel with {100 * outside:.2g} % of the peak of a model: please "
+                     "check it")
     return support
 
 
@@ -234,8 +236,8 @@ def _covered(plane, sets, notes):
     x, y = next(((x, y) for x, y in edges if known[x : nx - x, y : ny - y].all()), (0, 0))
     if not x:
         return plane
-    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, which the residual images cover; with vis all of the "
-                 "first model is compared")
+    notes.append(f"compared within {nx - 2 * x} x {ny - 2 * y} pixels, which the residual images cover; with vis all "
+                 "of the first model is compared")
     return plane.trimmed((x, y))
 
 
@@ -247,13 +249,13 @@ def _beside(sets, plane, notes):
             notes.append(f"'{one.name}' has no residual image; with vis one is made")
             continue
         if one.beam is None:
-            raise ValueError(f"models: '{one.residual.name}' has no beam, and there is no image or PSF with a beam: give "
-                             "vis, or add the restored image")
+            raise ValueError(f"models: '{one.residual.name}' has no beam, and there is no image or PSF with a beam: "
+                             "give vis, or add the restored image")
         image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
         if not np.isfinite(image).all():
             covered = 100 * np.isfinite(image).mean()
-            raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{sets[0].model.name}' and cannot "
-                             "be put on its pixels: give vis, and the residuals are made there")
+            raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{sets[0].model.name}' and "
+                             "cannot be put on its pixels: give vis, and the residuals are made there")
         weighting = "briggs" if one.weighting in ("briggs", "uniform") else "natural"
         if one.weighting not in ("briggs", "natural"):
             known = f"weighting '{one.weighting}'" if one.weighting else "an unknown weighting"
@@ -325,8 +327,8 @@ class _Observed:
     def minus(self, one, model):
         """Return the data minus the visibilities of a product's model, which is given on the common grid.
 
-        They are predicted from its own pixels where these have the common centre: regridding would blur it. A model of a
-        known spectral index keeps its spectrum.
+        They are predicted from its own pixels where these have the common centre: regridding would blur it. A model of
+        a known spectral index keeps its spectrum.
         """
         image = one.model
         plane, pixels = (image.plane, image.pixels) if image.plane.is_aligned(self.plane) else (self.plane, model)
@@ -357,6 +359,7 @@ def _common_gridder(sets, max_w, plane, notes):
                or one.parameters.get("taskname") == "tsara" and "gridder" not in one.parameters]
     if len(without) == len(sets) or phase < SMALLEST_W_PHASE:
         return "standard"
-    notes.append(f"the residuals of all are made with the w-term, which changes phases by up to {phase:.2g} rad in this image"
+    notes.append(f"the residuals of all are made with the w-term, which changes phases by up to {phase:.2g} rad in "
+                 "this image"
                  + "".join(f"; '{name}' was imaged without it" for name in without))
     return "wproject"

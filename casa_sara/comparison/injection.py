@@ -86,7 +86,8 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
         except ValueError as error:
             raise ValueError(f"inject = '{name}' is outside of '{one.name}', or closer to its edge than "
                              f"{injection.radius:.3g} arcsec: should be inside") from error
-    log.info(f"imaging '{one.name}' again without and with {len(places)} injected point sources of {injection.flux:.4g} Jy")
+    log.info(f"imaging '{one.name}' again without and with {len(places)} injected point sources of "
+             f"{injection.flux:.4g} Jy")
     without, with_sources = _repeat(one, places, injection.flux, selection, nthreads)
     more = with_sources.astype(float) - without
     found = {}
@@ -120,7 +121,7 @@ def _repeat(one, places, flux, selection, nthreads):
 
 
 def _visibilities(places, flux, data, grid):
-    """Return complex64 (M,), the visibilities of points at pixel coordinates, with the spectrum that the model has there."""
+    """Return complex64 (M,), the visibilities of points at pixel coordinates, with the model's spectrum there."""
     vis = np.zeros(data.size, np.complex64)
     for x, y in places:
         l, m = (grid.shape[0] // 2 - x) * grid.cell_rad[0], (y - grid.shape[1] // 2) * grid.cell_rad[1]

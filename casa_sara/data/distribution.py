@@ -147,7 +147,8 @@ def _is_of(wanted, of_row, row, chan):
 def _joined(parts):
     """Put parts one after the other."""
     begins = np.cumsum([0, *(part.rows.row.size for part in parts[:-1])])
-    rows = {name: np.concatenate([getattr(part.rows, name) for part in parts]) for name in RowTable.__dataclass_fields__}
+    rows = {name: np.concatenate([getattr(part.rows, name) for part in parts])
+            for name in RowTable.__dataclass_fields__}
     samples = {name: np.concatenate([getattr(part, name) for part in parts], axis=-1)
                for name in ("vis", "weight", "imaging_weight", "uvw", "chan", "freq_hz")
                if getattr(parts[0], name) is not None}

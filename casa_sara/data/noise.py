@@ -25,8 +25,8 @@ def noise_from_differences(visibilities, offsets, comm=SERIAL):
     hold the noise and what little of the sky curves in between. Where a block has too few
     of them, first differences V₁ − V₂ of variance 1/w₁ + 1/w₂ take their place. The noise is
     1.4826 times the median of |Re d|/σ_d and |Im d|/σ_d together, which outliers hardly move. Where the weights of a
-    block fall into levels (:func:`casa_sara.data.weight_levels.levels`), as when most rows are bad and hardly weighed, it is measured in
-    each: of levels of M_k samples the rms is √(Σ M_k·noise_k²/M), which a common median is not.
+    block fall into levels (:func:`casa_sara.data.weight_levels.levels`), as when most rows are bad and hardly weighed,
+    it is measured in each: of levels of M_k samples the rms is √(Σ M_k·noise_k²/M), which a common median is not.
 
     Parameters
     ----------

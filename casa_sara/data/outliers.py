@@ -50,16 +50,17 @@ class WildSamples:
 def find_wild(data, offsets, residual, flux_jy, comm=SERIAL):
     """Find samples that a first image cannot have left for any reason but their own.
 
-    A sample is wild when its residual exceeds 20 times the scale of the samples of like weight in its block (1.4826 × the
-    median of the whitened real and imaginary parts) and what the image predicts for it, and when either
+    A sample is wild when its residual exceeds 20 times the scale of the samples of like weight in its block (1.4826 ×
+    the median of the whitened real and imaginary parts) and what the image predicts for it, and when either
 
     - its amplitude exceeds 1.5 times the flux of the image, as no visibility of a positive sky does, or
-    - it stands alone: the residuals of the same baseline and channel before and after it (median of up to four) differ from
+    - it stands alone: the residuals of the same baseline and channel before and after it (median of up to four) differ
+    from
       it by more than half of it, as what the image lacks, or a calibration error, would not.
 
-    Of these only the ones within a factor 5 of the largest residual are named: they may have spoiled the image, and made
-    the others look wild, so a next image must tell.  Nothing is wild when more than 1 % of the samples would be. Samples that
-    weigh less by a factor of 100 have no say: they are neither neighbours nor counted.
+    Of these only the ones within a factor 5 of the largest residual are named: they may have spoiled the image, and
+    made the others look wild, so a next image must tell.  Nothing is wild when more than 1 % of the samples would be.
+    Samples that weigh less by a factor of 100 have no say: they are neither neighbours nor counted.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """Weights that fall into levels, with gaps between them where no weight is.
 
-They are counted in tenths of a decade, so what is found depends neither on their order nor on how they are spread over ranks.
+They are counted in tenths of a decade, so what is found depends neither on their order nor on how they are spread over
+ranks.
 """
 
 from __future__ import annotations

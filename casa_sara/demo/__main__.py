@@ -13,7 +13,8 @@ MARKER = ".casa_sara_demo"
 
 def main(arguments=None) -> int:
     """Run the demo and return its exit code."""
-    parser = argparse.ArgumentParser(prog="python -m casa_sara.demo", description="Compare tsara with tclean multiscale")
+    parser = argparse.ArgumentParser(prog="python -m casa_sara.demo",
+                                     description="Compare tsara with tclean multiscale")
     parser.add_argument("--out", type=Path, default=Path("demo-output"), help="folder for all output")
     parser.add_argument("--only", choices=("cyga", "3c273"), help="run one of the two parts")
     parser.add_argument("--smoke", action="store_true", help="a few seconds on a tiny simulated observation instead")

@@ -63,8 +63,8 @@ class Result:
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
     from the data, relative to the MS weights; `forecast` is the forecast of memory and time made before; `suspects`
-    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`. With several ranks, each has its own samples in `data`, and `size`
-    is the number of all.
+    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`. With several ranks, each has its own samples in
+    `data`, and `size` is the number of all.
     """
 
     data: Visibilities
@@ -95,7 +95,7 @@ class Split:
 
 @dataclass
 class PlaneImages:
-    """The images of one plane: `pixels` are 'psf', 'residual' and 'model', float32 (nx, ny); `weights` (M,) made them."""
+    """The images of one plane: `pixels` are 'psf', 'residual', 'model', float32 (nx, ny); `weights` (M,) made them."""
 
     pixels: dict[str, np.ndarray]
     weights: np.ndarray
@@ -361,7 +361,7 @@ def _predicted(operator, data, grid, options, model, comm):
 
 
 def _point_spread(data, grid, weighting, options, plane, comm):
-    """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and the beam fitted to it."""
+    """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and its fitted beam."""
     weights = imaging_weights(data, grid, weighting, comm)
     operator = Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm), comm)
     psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
@@ -378,13 +378,14 @@ def image_limits(data, grid, comm=SERIAL):
     arcsec = np.degrees(grid.cell_rad[0]) * 3600
     pixels = 1 / (max_uv * max(grid.cell_rad))
     if pixels < FEWEST_PIXELS:
-        notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below {FEWEST_PIXELS:g} "
-                     f"sources between pixels cannot be represented; 5 would be cell = '{arcsec * pixels / 5:.3g}arcsec'")
+        notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below "
+                     f"{FEWEST_PIXELS:g} sources between pixels cannot be represented; 5 would be cell = "
+                     f"'{arcsec * pixels / 5:.3g}arcsec'")
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
     phase = np.pi * max_w * corner_sq
     if phase > LARGEST_W_PHASE and grid.gridder == "standard":
-        notes.append(f"the w-term is not modelled: it changes phases by up to {phase:.2g} rad in the corners of this image; "
-                     "gridder = 'wproject' models it")
+        notes.append(f"the w-term is not modelled: it changes phases by up to {phase:.2g} rad in the corners of this "
+                     "image; gridder = 'wproject' models it")
     return notes
 
 
@@ -396,8 +397,8 @@ def _after_iterations(samples, grid, output, limits, read_s):
 
 def nowhere_visible(grid, output):
     """Return the warning about an image whose pixels are masked everywhere."""
-    return (f"phasecenter = '{grid.phasecenter}': the primary beam is below pblimit = {output.pblimit:g} in the whole image, so "
-            "all of its pixels are masked")
+    return (f"phasecenter = '{grid.phasecenter}': the primary beam is below pblimit = {output.pblimit:g} in the whole "
+            "image, so all of its pixels are masked")
 
 
 def describe(data, blocks, noise, stokes, comm=SERIAL):

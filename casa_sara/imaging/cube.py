@@ -52,7 +52,7 @@ class Channel:
 
 @dataclass
 class CubeResult:
-    """The results of one run, for the return value of the task; `stopped` is the stop code if it ended early, else 0."""
+    """The results of one run, for the task's return value; `stopped` is the stop code if it ended early, else 0."""
 
     data: Tally
     channels: list[Channel]
@@ -175,8 +175,8 @@ class _Cube:
         blank = np.diff(first) == 0
         if blank.all():
             grid = request.grid
-            raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no usable visibility "
-                             "is in these channels")
+            raise ValueError(f"start = {grid.start!r}, width = {grid.width!r}, nchan = {grid.nchan}: no usable "
+                             "visibility is in these channels")
         if blank.any():
             numbers = ", ".join(map(str, np.flatnonzero(blank)))
             data.notes.append(f"channels {numbers} are blank: they have no usable visibilities")
@@ -240,5 +240,6 @@ class _Cube:
         for name, pixels in found.pixels.items():
             self.images[name][k] = pixels
         channel.sumwt, channel.beam = found.sumwt, found.beam
-        channel.result = Result(Tally(data.size, data.dropped), data.size, blocks, noise, reconstruction, found.residual_peak,
+        channel.result = Result(Tally(data.size, data.dropped), data.size, blocks, noise, reconstruction,
+                                found.residual_peak,
                                 found.model_flux, {})

@@ -1,4 +1,4 @@
-"""Warnings about data and results that are no errors: suspect blocks, masks, scales larger than the shortest baseline sees."""
+"""Warnings about data and results: suspect blocks, masks, scales larger than the shortest baseline sees."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ FAR_ABOVE = 3.0  # times the median of the other blocks
 FAR_ABOVE_WEIGHTS = 1.5  # relative to the MS weights
 SEEN, LOWEST, MAIN = 0.6, 0.05, 0.2  # of the shortest baseline's fringe; of the peak; of the flux
 BINS = 5  # in the standard deviation of a Gaussian
-NAMES = {"thermal noise": "thermal noise is", "errors": "errors (noise and calibration) are"}  # of the reasons, for the log
+# of the reasons, for the log
+NAMES = {"thermal noise": "thermal noise is", "errors": "errors (noise and calibration) are"}
 FWHM = 2.3548200450309493  # of a Gaussian, in standard deviations
 
 
@@ -78,8 +79,9 @@ def left_outside(residual, support, sigma):
     if peak <= PEAK_OUTSIDE * sigma or peak <= ABOVE_INSIDE * float(size[support].max()):
         return []
     x, y = np.unravel_index(np.argmax(outside), outside.shape)
-    return [f"mask: the residual outside the mask reaches {peak:.3g} Jy/beam, {peak / sigma:.1f} times its noise, at pixel "
-            f"[{x}, {y}]: emission outside the mask raises the noise found, and its sidelobes disturb the model inside"]
+    return [f"mask: the residual outside the mask reaches {peak:.3g} Jy/beam, {peak / sigma:.1f} times its noise, at "
+            f"pixel [{x}, {y}]: emission outside the mask raises the noise found, and its sidelobes disturb the model "
+            "inside"]
 
 
 def suspects(blocks, measured, l2_bounds):
@@ -87,8 +89,8 @@ def suspects(blocks, measured, l2_bounds):
 
     From 2M numbers a noise level is known to 1/√(4M), 2 % for the smallest block, so a factor of 3 is no chance. Two
     levels are tested, each relative to the MS weights, against the median of the other blocks: the one that the
-    adaptation found, against the same MeasurementSet (calibration errors go with the flux that a configuration sees), or
-    against all where it has fewer than three blocks; and the thermal noise measured in the data, against all.
+    adaptation found, against the same MeasurementSet (calibration errors go with the flux that a configuration sees),
+    or against all where it has fewer than three blocks; and the thermal noise measured in the data, against all.
 
     Parameters
     ----------
@@ -123,9 +125,9 @@ def named_suspects(blocks, doubtful):
     """Yield a line for the log about each of the `suspects`."""
     for one in doubtful:
         level = one["noise_measured"] if one["reason"] == "thermal noise" else one["noise_found"]
-        yield (f"suspect data: block {one['block']}, {blocks[one['block']].label}: its {NAMES[one['reason']]} {level:#.3g} x MS "
-               f"weights, {level / one['others']:.2g} times the median of the other blocks. The reconstruction allows for "
-               "that; flag these data if they are bad")
+        yield (f"suspect data: block {one['block']}, {blocks[one['block']].label}: its {NAMES[one['reason']]} "
+               f"{level:#.3g} x MS weights, {level / one['others']:.2g} times the median of the other blocks. The "
+               "reconstruction allows for that; flag these data if they are bad")
 
 
 def beyond_baselines(model, cell_rad, shortest):
@@ -134,8 +136,8 @@ def beyond_baselines(model, cell_rad, shortest):
     A Gaussian of FWHM θ = 0.6/u has 28 % of its flux at the baseline u (exp(−(0.6π)²/4 ln 2)): of what is larger the
     data see less than that, and what the image has of it comes from the prior. Sources are the connected regions
     of the model, smoothed by θ/4, above 5 % of its peak, which hold 20 % of the flux at least; the size of one is 2.355
-    times its smaller standard deviation, so that one that is narrow in some direction passes. Pixels are summed to bins of
-    a fifth of the smoothing's standard deviation first.
+    times its smaller standard deviation, so that one that is narrow in some direction passes. Pixels are summed to bins
+    of a fifth of the smoothing's standard deviation first.
 
     Parameters
     ----------
@@ -165,7 +167,7 @@ def beyond_baselines(model, cell_rad, shortest):
             size = FWHM * np.sqrt(np.linalg.eigvalsh(np.cov(place, aweights=flux, ddof=0))[0])
             if size > largest:
                 arcsec = np.degrees([size, largest]) * 3600
-                return [f"the shortest baseline is sensitive to scales up to {arcsec[1]:.3g} arcsec (0.6 of its fringe), but "
-                        f"the image holds a source of {arcsec[0]:.3g} arcsec: its total flux is not measured by these data; add "
-                        "data with shorter baselines"]
+                return [f"the shortest baseline is sensitive to scales up to {arcsec[1]:.3g} arcsec (0.6 of its "
+                        f"fringe), but the image holds a source of {arcsec[0]:.3g} arcsec: its total flux is not "
+                        "measured by these data; add data with shorter baselines"]
     return []

@@ -97,8 +97,8 @@ def dry_run(selection, grid, options, blocks, limits):
     Returns
     -------
     dict
-        See :meth:`casa_sara.imaging.memory_forecast.Forecast.summary`, with `seconds` of each part and `iterations`; `reason` instead where it
-        does not fit.
+        See :meth:`casa_sara.imaging.memory_forecast.Forecast.summary`, with `seconds` of each part and `iterations`;
+        `reason` instead where it does not fit.
     """
     with kernels_loading(log.info):
         found, _ = forecast_run(selection, grid, options, limits)
@@ -129,8 +129,8 @@ def dry_run(selection, grid, options, blocks, limits):
 def _time_lines(timing):
     """The times as lines of a table."""
     channels = f" for each of {timing.channels} channels" if timing.channels > 1 else ""
-    yield (f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the number depends on "
-           "the data)")
+    yield (f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the number depends "
+           "on the data)")
     rows = {"reading": timing.reading, "building the operator": timing.building,
             "one NNLS iteration": timing.nnls_iteration, "one solver iteration": timing.iteration,
             "writing the images": timing.writing}

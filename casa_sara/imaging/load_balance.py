@@ -1,7 +1,7 @@
 """The division of the work among the ranks, so that all finish at the same time.
 
-The cost of one iteration, in ns on one core, measured by benchmarks/parallel.py at 2048² in single precision.  Only their
-ratios matter.
+The cost of one iteration, in ns on one core, measured by benchmarks/parallel.py at 2048² in single precision.  Only
+their ratios matter.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def operator_costs(volume, grid):
 def assign_ranks(comm, volume, grid, options, fits=lambda ranks: True):
     """Return the division of the work among the ranks: the fastest one for which all have enough memory.
 
-    Every rank that has visibilities does a whole Fourier transform, so their number, too, is chosen for the least time; the
-    bases then go to whoever has least to do, the costly ones first.
+    Every rank that has visibilities does a whole Fourier transform, so their number, too, is chosen for the least time;
+    the bases then go to whoever has least to do, the costly ones first.
 
     Parameters
     ----------
@@ -68,5 +68,6 @@ def assign_ranks(comm, volume, grid, options, fits=lambda ranks: True):
             load[owners[basis]] += bases[basis]
         plans.append((load.max(), RankAssignment(comm, readers, tuple(owners.tolist()))))
     least = min(load for load, _ in plans)
-    plans.sort(key=lambda plan: int(plan[0] / least / ALIKE))  # of plans that are alike the one with fewest readers first
+    # of plans that are alike the one with fewest readers first
+    plans.sort(key=lambda plan: int(plan[0] / least / ALIKE))
     return next((ranks for _, ranks in plans if fits(ranks)), plans[0][1])

@@ -36,8 +36,8 @@ REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one 
 class Workload:
     """What memory depends on; `reach` is the largest |u| and |v| in wavelengths, `max_w` the largest |w|.
 
-    `frequencies` tells whether the samples keep theirs, for a spectral index; `band` is the largest |ln(ν/ν0)| where that is an
-    image, else 0. A cube has `channels`, and `share` of the samples are in the one with most.
+    `frequencies` tells whether the samples keep theirs, for a spectral index; `band` is the largest |ln(ν/ν0)| where
+    that is an image, else 0. A cube has `channels`, and `share` of the samples are in the one with most.
     """
 
     samples: int
@@ -199,9 +199,10 @@ class Forecast:
     def lines(self):
         """The memory as lines of a table, for the log."""
         work, parts = self.workload, self.phases[self.peak_phase]
-        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak (phase: {self.peak_phase}) for "
-               f"{work.shape[0]} x {work.shape[1]} pixels{self._channels()} and {work.samples} visibilities; "
-               f"{self.resident / 1e9:.2f} GB are in use now, and {self.room / 1e9:.2f} GB more are available:")
+        yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak (phase: "
+               f"{self.peak_phase}) for {work.shape[0]} x {work.shape[1]} pixels{self._channels()} and {work.samples} "
+               f"visibilities; {self.resident / 1e9:.2f} GB are in use now, and {self.room / 1e9:.2f} GB more are "
+               "available:")
         for part, size in parts.items():
             yield f"  {part:<26}{size / 1e6:10.1f} MB"
         yield f"  {'total':<26}{self.needed / 1e6:10.1f} MB"

@@ -79,7 +79,8 @@ def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid,
 
 
 def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
-                watch: Watch | None = None, support: np.ndarray | None = None, ranks: RankAssignment = ALONE) -> Reconstruction:
+                watch: Watch | None = None, support: np.ndarray | None = None,
+                ranks: RankAssignment = ALONE) -> Reconstruction:
     """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
 
     Parameters
@@ -103,7 +104,8 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     """
     progress = log.Progress()
     preparing = _Preparing(progress)
-    report = partial(_report, progress, preparing, schedule_of(options).expected_iterations, watch.pace if watch else None)
+    report = partial(_report, progress, preparing, schedule_of(options).expected_iterations, watch.pace if watch
+                     else None)
     with stop_on_interrupt() as pressed:
         def stopped():
             preparing()
@@ -111,8 +113,8 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
 
         control = Control(report, stopped, watch.checkpoint if watch else None)
         if not (control.checkpoint and control.checkpoint.state is not None):
-            progress.prepare("computing the norm of the measurement operator, and the first image by non-negative least squares "
-                             f"(NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
+            progress.prepare("computing the norm of the measurement operator, and the first image by non-negative "
+                             f"least squares (NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
         reconstruction = reconstruct(samples, grid, options, startmodel, control, support, ranks)
     progress.close()
     record = reconstruction.record
@@ -122,7 +124,8 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     return reconstruction
 
 
-def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd, record):
+def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd,
+            record):
     """Show how far the solution is, after every iteration of `expected` ones."""
     preparing.over = True
     begun = record.resumed[-1] if record.resumed else 0
@@ -139,8 +142,8 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
     record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     samples = _samples_of_blocks(reconstruction, offsets, comm)
-    say(f"{record.stop_description}, after {record.iteration[-1]} iterations and {record.reweighting[-1]} re-weightings: "
-        f"reduced chi-square {_reduced(record.residual_norm[-1], samples.sum()):.4g}, model flux "
+    say(f"{record.stop_description}, after {record.iteration[-1]} iterations and {record.reweighting[-1]} "
+        f"re-weightings: reduced chi-square {_reduced(record.residual_norm[-1], samples.sum()):.4g}, model flux "
         f"{record.model_flux[-1]:.5g} Jy")
     if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
         log.info(f"restart = True continues from '{checkpoint.path}'")
@@ -214,8 +217,8 @@ def without_wild(data: Visibilities, blocks: list[BlockInfo], offsets: np.ndarra
     log.warn(f"{len(wild)} outliers, visibilities that no sky can explain, are left out:")
     for one in wild[:MOST_NAMED]:
         log.warn(f"  {one['ms']} row {one['row']}, spw {one['spw']}, channel {one['channel']}, antennas "
-                 f"{one['antenna1']} and {one['antenna2']}, {clock(one['time_mjd_s'])}: {one['amplitude_jy']:.4g} Jy where "
-                 f"the model has {one['predicted_jy']:.4g} Jy")
+                 f"{one['antenna1']} and {one['antenna2']}, {clock(one['time_mjd_s'])}: {one['amplitude_jy']:.4g} Jy "
+                 f"where the model has {one['predicted_jy']:.4g} Jy")
     if len(wild) > MOST_NAMED:
         log.warn(f"  … and {len(wild) - MOST_NAMED} more, which the record lists as 'wild'")
     samples = _samples_of_blocks(reconstruction, offsets, comm)
@@ -225,7 +228,7 @@ def without_wild(data: Visibilities, blocks: list[BlockInfo], offsets: np.ndarra
 
 def list_islands(record: SolverRecord, plane: ImagePlane, cell_rad: tuple[float, float], significance: float,
                  comm: Serial = SERIAL) -> None:
-    """Give the islands of a model their sky coordinates, list them in the log, and warn where the residual is not noise.
+    """Give the islands of a model sky coordinates, list them in the log, and warn where the residual is not noise.
 
     Parameters
     ----------
@@ -261,11 +264,12 @@ def _log_islands(record, significance, cell_rad):
                  f"FWHM {island['fwhm_arcsec']:.3g} arcsec")
     if faint:
         log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")
-    worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"], default=None)
+    worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"],
+                default=None)
     if worst and worst["snr"] > STRUCTURE:
         log.warn(f"the residual image is not consistent with noise: smoothed to {worst['beams']:g} beams it reaches "
-                 f"{worst['snr']:.3g} sigma. Possible causes are calibration errors, emission outside the image, or emission "
-                 "that the model cannot represent")
+                 f"{worst['snr']:.3g} sigma. Possible causes are calibration errors, emission outside the image, or "
+                 "emission that the model cannot represent")
 
 
 def _shortened(angle, digits):

@@ -1,10 +1,11 @@
 """Vectors for Numba kernels: a type for a few numbers that the processor handles at once, and what is done with them.
 
 LLVM's own vectoriser fails on the short loops of wavelets and of gridding: it cannot prove that input and output do not
-overlap, it halves the register width, and it does not unroll. The kernels therefore say what they mean. A `Vector` is as wide as the
-processor's registers (:func:`register`), or has a given number of lanes, which LLVM maps to registers. It is moved to and from an address in
-memory (a plain integer; `load`, `store`), or elements of a contiguous array (`load_at`, `store_at`), where the number of
-lanes is the length of a tuple, so that it is a constant of the compiled function.
+overlap, it halves the register width, and it does not unroll. The kernels therefore say what they mean. A `Vector` is
+as wide as the processor's registers (:func:`register`), or has a given number of lanes, which LLVM maps to registers.
+It is moved to and from an address in memory (a plain integer; `load`, `store`), or elements of a contiguous array
+(`load_at`, `store_at`), where the number of lanes is the length of a tuple, so that it is a constant of the compiled
+function.
 """
 
 from __future__ import annotations
@@ -18,9 +19,9 @@ from numba.core import cgutils
 from numba.core.datamodel import models
 from numba.extending import intrinsic, overload, register_model
 
-__all__ = ["LANE", "VECTOR_BYTES", "Vector", "element", "evens", "lane_bytes", "load", "load_at", "load_first", "maximum", "minimum", "move",
-           "multiply_add", "odds", "prefetch", "register", "scaled_sum", "shuffled", "splat", "splatted", "store", "store_at",
-           "store_first", "zeros", "zip_high", "zip_low"]
+__all__ = ["LANE", "VECTOR_BYTES", "Vector", "element", "evens", "lane_bytes", "load", "load_at", "load_first",
+           "maximum", "minimum", "move", "multiply_add", "odds", "prefetch", "register", "scaled_sum", "shuffled",
+           "splat", "splatted", "store", "store_at", "store_first", "zeros", "zip_high", "zip_low"]
 
 LANE = ir.IntType(32)  # numbers of lanes, for LLVM
 

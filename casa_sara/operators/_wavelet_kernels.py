@@ -39,7 +39,8 @@ MARGIN = MAX_TAPS // 2 - 1  # image lines needed before those of a chunk
 WINDOW_ROWS = 2 * CHUNK + MAX_TAPS
 ANALYSE_FINEST, ANALYSE_DEEPER, SYNTHESISE_DEEPER, BOTH_DEEPER, SYNTHESISE_FINEST = range(5)  # stages
 ZERO, ONE = np.int64(0), np.int64(1)  # literals would make Numba compile the callee for each
-SOURCE = "d71073de329e"  # digest of _vectors, _filter_bank and _wavelet_lines: the cache of compiled code watches this file only
+# digest of _vectors, _filter_bank and _wavelet_lines: the cache of compiled code watches this file only
+SOURCE = "367a868c6c75"
 
 _inlined = jit.inner(error_model="numpy", fastmath={"contract"}, inline="always")
 

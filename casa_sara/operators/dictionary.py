@@ -288,7 +288,7 @@ class SaraDictionary:
 
 @cache
 def _displacement(wavelet, level):
-    """Coefficients by which approximations 'a' and details 'd' of a level lie off the block of pixels that they describe."""
+    """Coefficients by which approximations 'a' and details 'd' of a level lie off the pixels that they describe."""
     size = 64 << level
     pixel = np.zeros(size)
     pixel[size // 2] = 1

@@ -26,7 +26,8 @@ from casa_sara.operators.decimation import AxisDecimation, decimate, expand, exp
 from casa_sara.operators.nufft import NonUniformFFT, memory_size
 from casa_sara.parallel.serial import SERIAL, Serial
 
-__all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "check_cell", "check_field", "choose_eps", "grid_bytes", "share_of"]
+__all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "check_cell", "check_field", "choose_eps", "grid_bytes",
+           "share_of"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 LARGEST_EPS = 1e-4
@@ -264,7 +265,8 @@ def check_field(longest: float, shape: tuple[int, int], cell_rad: tuple[float, f
     if width * longest < 1:
         cells = [f"{cell * ARCSEC_PER_RAD:.4g}arcsec" for cell in cell_rad]
         raise ValueError(f"imsize = {list(shape)} with cell = {cells} is an image {width * ARCSEC_PER_RAD:.3g} arcsec "
-                         f"wide: should be at least as wide as the finest fringe, {ARCSEC_PER_RAD / longest:.3g} arcsec")
+                         f"wide: should be at least as wide as the finest fringe, "
+                             f"{ARCSEC_PER_RAD / longest:.3g} arcsec")
 
 
 def _decimations(shape, reach, eps, dtype):
@@ -331,5 +333,6 @@ def choose_eps(vis: np.ndarray, weight: np.ndarray, dtype: npt.DTypeLike = np.fl
     float
         At most 1e-4, and not less than the operator can.
     """
-    peak, total = comm.allreduce(np.array([np.sum(values, dtype=np.float64) for values in (weight * np.abs(vis), weight)]))
+    peak, total = comm.allreduce(np.array([np.sum(values, dtype=np.float64)
+                                           for values in (weight * np.abs(vis), weight)]))
     return float(np.clip(np.sqrt(total) / max(peak, 1e-300), SMALLEST_EPS[np.dtype(dtype)], LARGEST_EPS))

@@ -1,13 +1,13 @@
 """A sum of few plain transforms with factors on pixels and on samples.
 
 What turns the plain transform V_m = Σ_p x_p exp(2πi(u_m l_p + v_m m_p)) into that of a wide field, or of a sky whose
-spectrum changes from pixel to pixel, is a factor exp(z c_m s_p) on each term, with z = i or z = 1, a number c_m for each
-sample and s_p in [−1, 1] for each pixel.  It is separated by the Chebyshev series (Jacobi and Anger)
+spectrum changes from pixel to pixel, is a factor exp(z c_m s_p) on each term, with z = i or z = 1, a number c_m for
+each sample and s_p in [−1, 1] for each pixel.  It is separated by the Chebyshev series (Jacobi and Anger)
 
     exp(i c s) = J_0(c) + 2 Σ_k i^k J_k(c) T_k(s),      exp(c s) = I_0(c) + 2 Σ_k I_k(c) T_k(s),
 
-with J_k, I_k the Bessel functions and T_k the Chebyshev polynomials: no term is larger than 2 (or 2 I_k), nothing cancels,
-and the images T_k(s)·x stay real.  About as many terms are needed as c has radians, and a few more.
+with J_k, I_k the Bessel functions and T_k the Chebyshev polynomials: no term is larger than 2 (or 2 I_k), nothing
+cancels, and the images T_k(s)·x stay real.  About as many terms are needed as c has radians, and a few more.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class ModulatedOperator:
 
 
 def terms_needed(largest: float, eps: float, modified: bool = False) -> int:
-    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`: the rest is below eps for |c| ≤ largest.
+    """Return the least number K of terms of exp(i c s), or exp(c s) if `modified`: the rest is < eps for |c| ≤ largest.
 
     Parameters
     ----------
@@ -111,7 +111,8 @@ def bessel_factors(argument: np.ndarray, count: int, modified: bool = False,
                    dtype: npt.DTypeLike = np.float32) -> np.ndarray:
     """Return (2 − δ_k0) J_k(c), or I_k(c) if `modified`, for the orders k < count.
 
-    The two highest orders are summed from their power series, the others follow by recurrence downwards, which is stable.
+    The two highest orders are summed from their power series, the others follow by recurrence downwards, which is
+    stable.
 
     Parameters
     ----------

@@ -285,7 +285,8 @@ def _spread(cells, stride, points, kernel, pieces, values, worker, workers):
         for p in range(points.shares[piece], points.shares[piece + 1]):
             q = points.order[p]
             down = polynomials(kernel.coefs, points.within[p, 0], points.within[p, 1], kernel.terms, kernel.lanes)
-            row = scale_pairs(second_half_twice(down), points.scales[p, 0] * values[q, 0], points.scales[p, 1] * values[q, 1])
+            row = scale_pairs(second_half_twice(down), points.scales[p, 0] * values[q, 0],
+                              points.scales[p, 1] * values[q, 1])
             scatter_rows(cells, points.first[p] + offset, stride, down, row, kernel.width)
 
 

@@ -4,8 +4,8 @@ Where the brightness follows a power law of the frequency with a known index,
 
     I(ν) = I(ν0)·(ν/ν0)^α,
 
-the image is that at ν0.  One α for the whole image is a factor on each sample; an image of α is a short sum of transforms
-(`modulated.py`), since (ν/ν0)^α = exp(c s) with s the place of α within its range.
+the image is that at ν0.  One α for the whole image is a factor on each sample; an image of α is a short sum of
+transforms (`modulated.py`), since (ν/ν0)^α = exp(c s) with s the place of α within its range.
 """
 
 from __future__ import annotations
@@ -76,7 +76,8 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid, freq_hz: np.ndarray | None = 
 def _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm):
     """The operator of a sky that does not change with frequency."""
     if grid.gridder == "standard":
-        return share_of(uvw[:2], grid.cell_rad, grid.shape, row_scale=row_scale, eps=eps, dtype=dtype, nthreads=nthreads,
+        return share_of(uvw[:2], grid.cell_rad, grid.shape, row_scale=row_scale, eps=eps, dtype=dtype,
+                        nthreads=nthreads,
                         comm=comm)
     if not uvw.shape[1] and comm.size > 1:
         return NoVisibilities(grid.shape, dtype, nthreads)

@@ -2,9 +2,9 @@
 
     V_m = Σ I exp(2πi [u l + v m + w (n − 1)]),      n = √(1 − l² − m²),
 
-exact to the accuracy asked for.  Two ways lead there: the factor exp(2πi w (n − 1)) as a short series of plain transforms
-(`modulated.py`), and the w-gridder of the package ducc0 (Arras et al. 2021, Ye et al. 2022).  The number of terms of the
-series grows with the largest phase, which therefore decides: `WTerm`.
+exact to the accuracy asked for.  Two ways lead there: the factor exp(2πi w (n − 1)) as a short series of plain
+transforms (`modulated.py`), and the w-gridder of the package ducc0 (Arras et al. 2021, Ye et al. 2022).  The number of
+terms of the series grows with the largest phase, which therefore decides: `WTerm`.
 """
 
 from __future__ import annotations
@@ -123,8 +123,8 @@ def _n_minus_1(l, m):
     """Return √(1 − l² − m²) − 1, without cancellation."""
     square = l**2 + m**2
     if square.max() >= 1:
-        raise ValueError(f"imsize and cell make an image whose corners are beyond the horizon: l² + m² = {square.max():.3g} "
-                         "there; should be below 1, with fewer or smaller pixels")
+        raise ValueError(f"imsize and cell make an image whose corners are beyond the horizon: l² + m² = "
+                         f"{square.max():.3g} there; should be below 1, with fewer or smaller pixels")
     return -square / (1 + np.sqrt(1 - square))
 
 

@@ -26,8 +26,8 @@ SHARED_MEMORY = "/dev/shm"
 class MPI(Serial):
     """One rank of several processes.
 
-    Errors: before ranks exchange anything they meet at a barrier that does not block.  While a rank waits there it looks
-    for word of an error of another rank, and raises it too.  So no rank waits for one that will not come.
+    Errors: before ranks exchange anything they meet at a barrier that does not block.  While a rank waits there it
+    looks for word of an error of another rank, and raises it too.  So no rank waits for one that will not come.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ class MPI(Serial):
         return list(memory)
 
     def _node_has_room(self, size):
-        """Whether this machine's shared memory takes `size` more bytes, by the word of its first rank; and is shared."""
+        """Whether this machine has shared memory, and room for `size` more bytes in it, as its first rank finds."""
         free = shutil.disk_usage(SHARED_MEMORY).free if os.path.isdir(SHARED_MEMORY) else np.inf
         self._meet()
         return self.node_size > 1 and self._node.bcast(free > 1.1 * size + PIECE // 16)
@@ -295,5 +295,6 @@ def world():
                          "(Open MPI or MPICH), the same that mpirun belongs to") from error
     if mpi.COMM_WORLD.Get_size() == 1 and os.environ.get("OMPI_COMM_WORLD_SIZE", "1") != "1":
         raise ValueError("parallel = True: mpi4py was built for another MPI than the one whose mpirun started this "
-                         "process: every rank believes to be alone; pip install --force-reinstall --no-binary mpi4py mpi4py")
+                         "process: every rank believes to be alone; pip install --force-reinstall --no-binary mpi4py "
+                         "mpi4py")
     return MPI(mpi.COMM_WORLD)

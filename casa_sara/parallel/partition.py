@@ -40,7 +40,8 @@ class RankAssignment:
 
     def wavelets(self, names):
         """Return this rank's bases, of these."""
-        return names if self.owners is None else tuple(name for name, rank in zip(names, self.owners) if rank == self.comm.rank)
+        return names if self.owners is None else tuple(name for name, rank in zip(names, self.owners)
+                                                       if rank == self.comm.rank)
 
     def gather_bases(self, coefs):
         """Return the coefficients of all bases in their order, on rank 0; None on the others."""
@@ -59,7 +60,8 @@ class RankAssignment:
         """Return this rank's part of the coefficients of rank 0; the others give None."""
         if self.owners is None:
             return whole
-        return self.comm.scatter(None if self.comm.rank else [whole[np.equal(self.owners, r)] for r in range(self.comm.size)])
+        return self.comm.scatter(None if self.comm.rank
+                                 else [whole[np.equal(self.owners, r)] for r in range(self.comm.size)])
 
 
 ALONE = RankAssignment()

@@ -1,7 +1,7 @@
 """The small communicator of one process; casa_sara/parallel/mpi.py has that of the ranks of an MPI job.
 
-All that ranks say to each other goes through these two classes.  Their methods are called by every rank in the same order;
-`Serial` does what numpy does, at no cost.
+All that ranks say to each other goes through these two classes.  Their methods are called by every rank in the same
+order; `Serial` does what numpy does, at no cost.
 """
 
 from __future__ import annotations

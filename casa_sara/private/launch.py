@@ -16,8 +16,8 @@ __all__ = ["in_parallel", "serve"]
 def in_parallel(run: Callable, parameters: dict[str, Any]) -> dict[str, Any]:
     """Run the task on all ranks and return the same on each.
 
-    Where casampi is in charge (mpicasa, or mpirun with casampi installed) only its client comes here: its other processes
-    wait for commands from the moment casatasks is imported.
+    Where casampi is in charge (mpicasa, or mpirun with casampi installed) only its client comes here: its other
+    processes wait for commands from the moment casatasks is imported.
 
     Raises
     ------
@@ -69,7 +69,8 @@ def _push(servers, run, parameters):
     client.set_log_mode("redirect")
     client.start_services()
     task = f"__import__({run.__module__!r}, fromlist=[{run.__name__!r}]).{run.__name__}"
-    command = f"__import__({__name__!r}, fromlist=['serve']).serve({task}, {parameters!r}, {servers!r}, {os.getcwd()!r})"
+    command = (f"__import__({__name__!r}, fromlist=['serve'])"
+               f".serve({task}, {parameters!r}, {servers!r}, {os.getcwd()!r})")
     answers = client.push_command_request(command, block=True, target_server=servers)
     failed = [answer for answer in answers if not answer["successful"]]
     if failed:

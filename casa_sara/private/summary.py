@@ -16,7 +16,8 @@ WHY = {
     "decreases with every re-weighting, and is halved where the residual rises; affects the speed of convergence only",
     "noise_jy_per_beam": "of the naturally weighted dirty image, computed from the MS weights and the noise found",
     "data_norm_sq": "largest eigenvalue of the preconditioned normal operator, by Lanczos iterations",
-    "regscale": "the task parameter; with 1, the weight of the prior is the noise of one coefficient of the gradient of the "
+    "regscale": "the task parameter; with 1, the weight of the prior is the noise of one coefficient of the gradient "
+                "of the "
     "data term",
 }
 PAPER_WHY = {

@@ -61,8 +61,8 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     _refuse_for_cubes(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"] and comm.size > 1:
-        raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is in "
-                         "the first lines of the log of a normal run, and docs/parallel.md explains its time")
+        raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is "
+                         "in the first lines of the log of a normal run, and docs/parallel.md explains its time")
     if parameters["dryrun"]:
         return {"forecast": dry_run(selection, grid, options, _blocks(parameters), limits)}
     make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
@@ -94,8 +94,8 @@ def _warn_of_incomplete(vis, output):
     if output.savemodel == "modelcolumn":
         return
     for name in incomplete_columns(vis):
-        log.warn(f"MODEL_DATA of '{name}' is incomplete, because a run was killed while it wrote it. Do not calibrate with "
-                 "it before tsara with restart=True, niter=0, savemodel='modelcolumn' has written it again")
+        log.warn(f"MODEL_DATA of '{name}' is incomplete, because a run was killed while it wrote it. Do not calibrate "
+                 "with it before tsara with restart=True, niter=0, savemodel='modelcolumn' has written it again")
 
 
 def _report(imagename, selection, nthreads):
@@ -166,13 +166,14 @@ def _refuse_for_cubes(parameters):
         raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes can only be made in "
                          "Stokes I; should be 'I'")
     if parameters["usemask"] == "pb" or parameters["mask"]:
-        raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': masks "
-                         "can only be used for continuum images; should be usemask = 'user', mask = ''")
+        raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': "
+                         "masks can only be used for continuum images; should be usemask = 'user', mask = ''")
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
     if parameters["report"]:
-        raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be False")
+        raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be "
+                         "False")
 
 
 def _check_stokes(parameters):
@@ -184,8 +185,8 @@ def _check_stokes(parameters):
                                 ("savemodel", "none", "MODEL_DATA is written for Stokes I only"),
                                 ("report", False, "reports are made for Stokes I only")):
         if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} is not possible with stokes = '{stokes}', {reason}: set {name} = "
-                             f"{right!r}")
+            raise ValueError(f"{name} = {parameters[name]!r} is not possible with stokes = '{stokes}', {reason}: set "
+                             f"{name} = {right!r}")
 
 
 def _check_method(parameters):
@@ -217,8 +218,8 @@ def _mask(parameters):
     mask = parameters["mask"]
     entries = tuple(entry for entry in ([mask] if isinstance(mask, str) else mask) if entry.strip())
     if parameters["usemask"] == "user" and parameters["pbmask"] and not entries:
-        raise ValueError(f"pbmask = {parameters['pbmask']:g} has no effect without a mask, as in tclean: set usemask = 'pb', "
-                         "give a mask, or leave pbmask at 0.0")
+        raise ValueError(f"pbmask = {parameters['pbmask']:g} has no effect without a mask, as in tclean: set usemask = "
+                         "'pb', give a mask, or leave pbmask at 0.0")
     return entries
 
 
@@ -256,10 +257,11 @@ def _seconds(maxtime):
 
 def _solver_options(parameters, comm):
     if parameters["databound"] == "fixed" and not parameters["l2bound"]:
-        raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
-                         "blocks or one for each, relative to the MS weights")
+        raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for "
+                         "all blocks or one for each, relative to the MS weights")
     if not parameters["regscale"] > 0:
-        raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the automatic weight of the prior")
+        raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the automatic weight of the "
+                         "prior")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}
     values = {name: tuple(value) if isinstance(value := parameters[name], list) else value for name in names}
     nthreads = min(parameters["nthreads"] or _own_cores(comm), os.cpu_count() or 1)
@@ -302,6 +304,7 @@ def _model_to_continue(imagename, startmodel, old):
                  "starting from the beginning")
         return startmodel
     if startmodel:
-        raise ValueError(f"startmodel = '{startmodel}' and restart = True both define the first model: set only one of them")
+        raise ValueError(f"startmodel = '{startmodel}' and restart = True both define the first model: set only one of "
+                         "them")
     log.info(f"restart = True: continuing from '{model}'")
     return model

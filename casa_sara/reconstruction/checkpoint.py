@@ -102,7 +102,8 @@ class Checkpoint:
         if not read:
             return
         age = time.time() - self._found["written"]
-        self.tell(f"continuing from '{self.path}', iteration {self._found['iteration']}, written {age / 60:.1f} min ago")
+        self.tell(f"continuing from '{self.path}', iteration {self._found['iteration']}, "
+                      f"written {age / 60:.1f} min ago")
         self.state = None
 
     def due(self, now: bool = False) -> bool:

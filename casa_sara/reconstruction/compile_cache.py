@@ -1,9 +1,9 @@
 """The compiled kernels, made ready by a thread while CASA reads.
 
-Numba compiles a kernel when it is first called, and keeps it on the disk (:mod:`casa_sara.runtime.jit`); after that a new process
-loads it. All kernels of a solution are compiled in one go by the first process that needs them, with the help of a second
-process that compiles those of the dictionary; a mark beside them then says so. `python -m casa_sara.reconstruction.compile_cache` compiles
-beforehand.
+Numba compiles a kernel when it is first called, and keeps it on the disk (:mod:`casa_sara.runtime.jit`); after that a
+new process loads it. All kernels of a solution are compiled in one go by the first process that needs them, with the
+help of a second process that compiles those of the dictionary; a mark beside them then says so. `python -m
+casa_sara.reconstruction.compile_cache` compiles beforehand.
 """
 
 from __future__ import annotations
@@ -34,22 +34,24 @@ __all__ = ["compile_kernels", "kernels_loading", "use_every_kernel"]
 HELPER_SECONDS = 120.0  # after which this process compiles what the helper should have
 SHAPE = (32, 32)
 # sys.path comes along; the folder that Python puts first is the user's, whose files may have the names of modules
-_HELP = "import sys; sys.path[:] = sys.argv[1:]; from casa_sara.reconstruction.compile_cache import _use_dictionary; _use_dictionary()"
+_HELP = ("import sys; sys.path[:] = sys.argv[1:]; "
+         "from casa_sara.reconstruction.compile_cache import _use_dictionary; _use_dictionary()")
 
 
 @contextmanager
 def kernels_loading(tell: Callable[[str], None]) -> Iterator[None]:
     """Have a thread load the compiled kernels, a quarter of a second's work in a new process; the end waits for it.
 
-    CASA's tools let other threads go on while they work, so that this costs next to nothing. Kernels that are not compiled
-    yet are, which `tell` is told.
+    CASA's tools let other threads go on while they work, so that this costs next to nothing. Kernels that are not
+    compiled yet are, which `tell` is told.
     """
     mark = _mark()
     if mark is None:
-        tell("compiling the numerical kernels, 10 to 20 s: no folder for compiled code can be written to, so that every "
-             "process compiles them; set NUMBA_CACHE_DIR to a folder that can")
+        tell("compiling the numerical kernels, 10 to 20 s: no folder for compiled code can be written to, so that "
+             "every process compiles them; set NUMBA_CACHE_DIR to a folder that can")
     elif not mark.exists():
-        tell(f"compiling the numerical kernels for this computer, 5 to 10 s, once: later runs find them in '{mark.parent}'")
+        tell(f"compiling the numerical kernels for this computer, 5 to 10 s, once: later runs find them in "
+             f"'{mark.parent}'")
     thread = threading.Thread(target=compile_kernels, name="casa_sara kernels")
     thread.start()
     try:
@@ -116,7 +118,8 @@ def _mark():
     package = Path(__file__).parents[1]
     known = hashlib.sha256(repr((numba.__version__, sys.version_info[:2], llvm.get_host_cpu_name(),
                                  llvm.get_host_cpu_features().flatten())).encode())
-    for source in sorted([*package.glob("operators/*.py"), *package.glob("solver/*.py"), package / "runtime/jit.py", Path(__file__)]):
+    for source in sorted([*package.glob("operators/*.py"), *package.glob("solver/*.py"), package / "runtime/jit.py",
+                          Path(__file__)]):
         known.update(source.read_bytes())
     return Path(folder) / f"casa_sara-{known.hexdigest()[:16]}.compiled"
 

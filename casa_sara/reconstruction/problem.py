@@ -193,8 +193,8 @@ def _told_of_all(found, samples, layout, comm):
 def _preconditioner(samples, wanted, comm):
     """U = 1/density, largest value 1.
 
-    Samples of very low weight that are alone in their uv cells (bad data that were down-weighted instead of flagged) are not
-    raised to the weight of other cells: the density is taken to be at least 1e-2·Σw²/Σw.
+    Samples of very low weight that are alone in their uv cells (bad data that were down-weighted instead of flagged)
+    are not raised to the weight of other cells: the density is taken to be at least 1e-2·Σw²/Σw.
     """
     weight = samples.data.weight
     if not wanted:

@@ -46,7 +46,8 @@ class Control:
         iteration follows.
     checkpoint : Checkpoint, optional
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
-        whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
+        whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes
+        it.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
@@ -215,7 +216,7 @@ class _Solution:
         return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, samples.noise, options))
 
     def state(self, stage, layout, ranks):
-        """Return, on rank 0, all that :func:`_resume` needs beside the data and the parameters, as one rank alone has it."""
+        """Return, on rank 0, all that :func:`_resume` needs beside data and parameters, as one rank alone has it."""
         left_out = np.concatenate(ranks.comm.allgather(layout.numbers(self.found.left_out)))
         found = vars(self.found) | dict(left_out=np.sort(left_out))
         ppd, kept = self.ppd.state(), Layout(self.ppd.offsets, ranks.comm)

@@ -1,4 +1,4 @@
-"""The process and its machine: memory, cores, signals, time limits, compiled kernels, files that are written atomically.
+"""The process and its machine: memory, cores, signals, time limits, compiled kernels, atomically written files.
 
 Nothing of radio astronomy.
 """

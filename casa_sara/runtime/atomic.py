@@ -1,9 +1,9 @@
 """Files that appear whole, or not at all: one file, or several that replace older ones together.
 
-Several files ROOT.x, ROOT.y, … are written in the folder `.ROOT.new`, beside their places. When all are complete the folder is renamed
-`.ROOT.whole`, and from then on they count: the older files go to `.ROOT.old`, the folder becomes `.ROOT.moving`, its contents go
-to their places, and `.ROOT.old` is removed. A process that is killed leaves one of these folders, and the next one goes by
-it: `.new` is thrown away, `.whole` and `.moving` are followed to the end.
+Several files ROOT.x, ROOT.y, … are written in the folder `.ROOT.new`, beside their places. When all are complete the
+folder is renamed `.ROOT.whole`, and from then on they count: the older files go to `.ROOT.old`, the folder becomes
+`.ROOT.moving`, its contents go to their places, and `.ROOT.old` is removed. A process that is killed leaves one of
+these folders, and the next one goes by it: `.new` is thrown away, `.whole` and `.moving` are followed to the end.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def _folder_of(root, stage):
 
 
 def sync(folder: str) -> None:
-    """Bring the files and folders in a folder to the disk, so that a power failure does not undo the order of events."""
+    """Bring the files and folders in a folder to the disk, so that a power failure keeps the order of events."""
     for parent, _, names in os.walk(folder):
         for path in [parent, *(os.path.join(parent, name) for name in names)]:
             _fsync(path)

@@ -17,7 +17,7 @@ NOT_FROM_PYTHON = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 
 def kernel(**options: Any) -> Callable:
-    """Return a decorator for a function that Python calls: it runs without Python's lock, compiled once for all processes.
+    """Return a decorator for a function that Python calls: it runs without the GIL, compiled once for all processes.
 
     Where no folder can be written, every process compiles its own.
     """

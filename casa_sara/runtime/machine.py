@@ -54,7 +54,7 @@ def _machine_memory() -> int:
 
 
 def _memory_groups() -> Iterator[tuple[Path, str, str, str]]:
-    """Yield (folder, file with the limit, file with the use, name of the cache's size) of each group of this process."""
+    """Yield (folder, file of the limit, file of the use, name of the cache's size) of each group of this process."""
     try:
         lines = (_PROC / "self/cgroup").read_text().split("\n")
     except OSError:

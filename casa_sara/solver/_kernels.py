@@ -86,7 +86,7 @@ def add_scaled(data_gradient, prior_gradient, l2_step, worker, workers):
 
 @_jit
 def nnls_step(model, momentum, gradient, step, penalty, positivity, uphill, worker, workers):
-    """Replace the gradient g at the momentum point m by x⁺ = m + step·g, less the penalty towards 0, x⁺ ≥ 0 if `positivity`.
+    """Replace the gradient g at the momentum point m by x⁺ = m + step·g, less the penalty, x⁺ ≥ 0 if `positivity`.
 
     Entry i of `uphill` becomes Σ(m − x⁺)(x⁺ − x) of row i.
     """

@@ -94,8 +94,8 @@ class AdaptivePPD:
     tau, l2_step : float
         τ, and η = 1/`data_norm_sq`.
     lowest : real (nx, ny)
-        Least value of each pixel: 0, or −∞ without positivity and for pixels of `points`; +∞ for pixels that stay 0, see
-        :meth:`confine`.
+        Least value of each pixel: 0, or −∞ without positivity and for pixels of `points`; +∞ for pixels that stay 0,
+        see :meth:`confine`.
     points : PointSources
         Sources of which only the flux is free.
     confined_to : bool (nx, ny) or None
@@ -135,7 +135,8 @@ class AdaptivePPD:
         dtype = vis.real.dtype
         self.model, self.anchor, self.model_bar, self.lowest = comm.shared_images(4, measurement.shape, dtype)
         self.lowest[...] = 0 if positivity else -np.inf
-        self._data_gradient, self._slots = np.zeros(measurement.shape, dtype), comm.shared_slots(measurement.shape, dtype)
+        self._data_gradient = np.zeros(measurement.shape, dtype)
+        self._slots = comm.shared_slots(measurement.shape, dtype)
         self._prior_gradient = self._slots[comm.rank] if self._slots else np.zeros(measurement.shape, dtype)
         self.l2_dual, self._phi_bar, self._phi_anchor = (np.zeros_like(vis) for _ in range(3))
         self.l1_dual, self.l1_weights = dictionary.allocate(), dictionary.allocate()
@@ -173,7 +174,7 @@ class AdaptivePPD:
         return zip(self.offsets[:-1].tolist(), self.offsets[1:].tolist())
 
     def confine(self, support: np.ndarray) -> None:
-        """Keep the model 0 outside a support, bool (nx, ny): the projection of Step 17 is then on {x ≥ 0, x = 0 outside}.
+        """Keep the model 0 outside a support: the projection of Step 17 is then on {x ≥ 0, x = 0 outside}.
 
         Parameters
         ----------
@@ -184,7 +185,7 @@ class AdaptivePPD:
         self.comm.barrier()
 
     def support_only(self, support: np.ndarray, points: PointSources = PointSources()) -> None:
-        """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; elsewhere it is free again.
+        """Keep the model 0 outside this support from now on, and outside that of :meth:`confine`; free it elsewhere.
 
         At `points`, which the support holds, it is free in its flux only.
 

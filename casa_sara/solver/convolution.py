@@ -23,6 +23,7 @@ def convolve_valid(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     """
     axes = [axis for axis in range(2) if min(image.shape[axis], kernel.shape[axis]) > 1]  # along others it is a product
     whole = [fft.next_fast_len(image.shape[axis] + kernel.shape[axis] - 1, real=True) for axis in axes]
-    product = fft.irfftn(fft.rfftn(image, whole, axes) * fft.rfftn(kernel, whole, axes), whole, axes) if axes else image * kernel
+    product = fft.irfftn(fft.rfftn(image, whole, axes) * fft.rfftn(kernel, whole, axes), whole, axes) if axes \
+        else image * kernel
     (first, last), (left, right) = ((size - 1, n) for n, size in zip(image.shape, kernel.shape))
     return product[first:last, left:right].copy()

@@ -50,7 +50,7 @@ def band_noise(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds,
 
 
 def _normal(rng, begin, count, size):
-    """Return `count` of `size` standard normal numbers, from number `begin` on; all are drawn, as one rank alone does."""
+    """Return `count` of `size` standard normal numbers, from number `begin` on; all are drawn, as by one rank."""
     if count == size:
         return rng.standard_normal(size)
     chosen = np.empty(count)
@@ -68,7 +68,7 @@ def _rms(values):
 
 
 def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confined: bool = False) -> None:
-    """W = ν: the noise of every band in units of a pixel's, but at least 1; those of the approximations less if `confined`.
+    """W = ν: the noise of every band in units of a pixel's, at least 1; those of the approximations less if `confined`.
 
     Where the beam spans many pixels, or short baselines abound, the noise lives in the coarse bands; there a
     threshold at the noise of one pixel would let it through.
@@ -102,8 +102,8 @@ def reweight(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, scale: floa
     """W = ν α/(α + d̄), α = scale × the noise of the band, or of a pixel where that is less.
 
     Within a support of what is significant (`confined`) the coarse bands cannot fill with noise any more, and the prior
-    may let go of them sooner: there α is scale × the noise of a coefficient of the model, that of a pixel over ν.  Around
-    point sources W is a quarter.
+    may let go of them sooner: there α is scale × the noise of a coefficient of the model, that of a pixel over ν.
+    Around point sources W is a quarter.
 
     Parameters
     ----------

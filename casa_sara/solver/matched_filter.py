@@ -4,15 +4,15 @@ A source of shape q in data whose other sources x_far are known has the signal-t
 
     T = ⟨q, Φ†Σ⁻¹(y − Φx_far)⟩ / ‖Σ^{−½}Φq‖,
 
-normal with unit variance where there is nothing but noise.  q is a Gaussian around a pixel.  Near the pixel is where the
-response K = Φ†Σ⁻¹Φq is above a fraction of its peak; with x_far the model beyond that,
+normal with unit variance where there is nothing but noise.  q is a Gaussian around a pixel.  Near the pixel is where
+the response K = Φ†Σ⁻¹Φq is above a fraction of its peak; with x_far the model beyond that,
 
     T = [q ⊛ Φ†Σ⁻¹(y − Φx) + (K where near) ⊛ x] / ‖Σ^{−½}Φq‖:
 
 what is left in the residual and what the model holds nearby, whatever noise the model has been fitted to.
 
-A template that reaches over the edge of the image is cut there, and then sees noise of baselines that average it away where it
-is whole: where ‖Σ^{−½}Φq‖ of the cut one is larger, T is divided by that.
+A template that reaches over the edge of the image is cut there, and then sees noise of baselines that average it away
+where it is whole: where ‖Σ^{−½}Φq‖ of the cut one is larger, T is divided by that.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class MatchedFilter:
     Attributes
     ----------
     beam : float
-        FWHM of the natural beam, of a circle of the same area, pixels; without the plateau under it that baselines leave
-        which do not resolve the image, as those between the telescopes of one site.
+        FWHM of the natural beam, of a circle of the same area, pixels; without the plateau under it that baselines
+        leave which do not resolve the image, as those between the telescopes of one site.
     widths : list of float
         FWHM of the templates, pixels; the first is 0, a point.
     sidelobe : float
@@ -127,7 +127,7 @@ class MatchedFilter:
         return self._known[scale]
 
     def _near(self, response, fraction):
-        """The disc around the centre out to where the response, averaged over circles, falls below a fraction of its peak.
+        """The disc around the centre, to where the response, averaged over circles, falls below a fraction of its peak.
 
         Above the plateau of baselines that see the whole image as a point.
         """
@@ -216,7 +216,7 @@ def distance(shape: tuple[int, int]) -> np.ndarray:
 
 
 def _cut_norms(psf, width):
-    """‖Σ^{−½}Φq‖ of a Gaussian that the edges of the first axis cut, over that of a whole one, at least 1: float32 (nx,).
+    """‖Σ^{−½}Φq‖ of a Gaussian cut by the edges of the first axis, over that of a whole one, at least 1: float32 (nx,).
 
     q is a product a(x) b(y), so that ‖·‖² = Σ a(x) a(x′) p(x − x′), with p the response summed over y as b asks for.
     """

@@ -1,8 +1,9 @@
 """Point sources between pixels, in the model.
 
 Pixels that may only be positive hold a source between them as something wider, and the data answer with too much flux:
-2π²·var·⟨u²⟩ of it, 8 % where the beam has 3.5 pixels.  A known point is held by 6 × 6 pixels in the one shape s that has, for
-the data, its place: Lagrange's interpolation, with small negative pixels.  Only its flux is free: the model is a·s there, a ≥ 0.
+2π²·var·⟨u²⟩ of it, 8 % where the beam has 3.5 pixels.  A known point is held by 6 × 6 pixels in the one shape s that
+has, for the data, its place: Lagrange's interpolation, with small negative pixels.  Only its flux is free: the model is
+a·s there, a ≥ 0.
 """
 
 from __future__ import annotations

@@ -31,11 +31,11 @@ class Release:
 
         g = Φ†UΣ⁻¹(y − Φx) / √(Σ_m U_m² w_m/σ_m²),
 
-    is noise of unit variance where the model is right.  A pixel at its lower bound asks to be released where g < −3, and
-    where a lobe of the brightest pixel within 3 pixels, −0.25 × its value, would change the gradient there by more than g.
-    Where it asks in two calls one after the other, for at least half as much the second time (a model that still moves
-    swings to either side, and what it leaves fades), and up to 3 pixels around, the lower bound becomes that lobe.  What was
-    released once stays so.
+    is noise of unit variance where the model is right.  A pixel at its lower bound asks to be released where g < −3,
+    and where a lobe of the brightest pixel within 3 pixels, −0.25 × its value, would change the gradient there by more
+    than g. Where it asks in two calls one after the other, for at least half as much the second time (a model that
+    still moves swings to either side, and what it leaves fades), and up to 3 pixels around, the lower bound becomes
+    that lobe.  What was released once stays so.
     """
 
     def __init__(self):

@@ -179,7 +179,7 @@ def _connected(snr, level):
 
 
 def _around_cores(found, width):
-    """What is within RIM widths of the parts of a support that are CORE widths deep, on a grid that the width allows."""
+    """What is within RIM widths of the parts of a support that are CORE widths deep, on a grid of suitable step."""
     step = max(1, int(width // PIXELS))
     cores = distance_transform_edt(found[::step, ::step]) * step >= CORE * width
     if not cores.any():
@@ -189,7 +189,7 @@ def _around_cores(found, width):
 
 
 def _excess(snr, empty):
-    """Noise of the residual image where the model is empty, in units of what it should be; 1 where it is not much more."""
+    """Noise of the residual image where the model is empty, over what it should be; 1 where it is not much more."""
     values = snr[empty] if 5 * np.count_nonzero(empty) > snr.size else snr
     noise = MEDIAN_TO_SIGMA * float(np.median(np.abs(values)))
     return min(noise, MOST_EXCESS) if noise > EXCESS else 1.0

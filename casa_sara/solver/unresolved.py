@@ -70,7 +70,7 @@ def unresolved(filter_: MatchedFilter, gradient: np.ndarray, model: np.ndarray, 
 
 
 def _without_fragments(support, given_up, area):
-    """A support without the parts smaller than this that lie at what was given up: what is left of a source's surroundings."""
+    """A support without the parts smaller than this at points given up: remains of a source's surroundings."""
     labels, number = label(support)
     sizes = np.bincount(labels.ravel(), minlength=number + 1)
     beside = np.zeros(number + 1, bool)

@@ -16,7 +16,8 @@ SEVERAL = re.compile(r"\w+(, \w+)+(?= :|$)")  # attributes in one line
 def modules(page: str) -> list[str]:
     """Return the names of the modules of an API page."""
     paths = PACKAGE.glob("*.py") if page == BESIDE else (PACKAGE / page).rglob("*.py")
-    names = (".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in paths if not path.stem.startswith("_"))
+    names = (".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
+             for path in paths if not path.stem.startswith("_"))
     return sorted(names)
 
 

@@ -1,7 +1,7 @@
 """Pages with the source code, and links to lines of it that are found when the site is built.
 
-A link to a Python file, as `[text](../casa_sara/data/noise.py)`, opens the page of that file. Where its text is the name
-of a function, a class or a method of the file, as in
+A link to a Python file, as `[text](../casa_sara/data/noise.py)`, opens the page of that file. Where its text is the
+name of a function, a class or a method of the file, as in
 
     [`AdaptivePPD.step`](../casa_sara/solver/adaptive_ppd.py "Step 13")
 

@@ -83,7 +83,8 @@ def dies_in(module, name, call=1, after=False):
 
 
 def begun_with(script):
-    """Return the program of the child process of `casa_sara.casa.runtime.child_process`, with a script of Python before its job."""
+    """Return the program of the child process of `casa_sara.casa.runtime.child_process`,
+    with a script of Python before its job."""
     from casa_sara.casa.runtime import child_process
 
     first, main = child_process._START.rsplit("; ", 1)

@@ -163,10 +163,12 @@ def remake(col, change, manager="StandardStMan", **description):
             old = tb.getcoldesc(col)
             new = {key: old[key] for key in ("valueType", "comment", "keywords", "ndim") if key in old} | description
             new = {key: value for key, value in new.items() if (key, value) != ("ndim", 0)}
-            new |= dict(option=4 if "shape" in new else 0, maxlen=0, dataManagerType=manager, dataManagerGroup="new_" + col)
+            new |= dict(option=4 if "shape" in new else 0, maxlen=0, dataManagerType=manager,
+                        dataManagerGroup="new_" + col)
             tiles = dict(DEFAULTTILESHAPE=[2] * new.get("ndim", 0) + [16])
             _drop(tb, col)
-            tb.addcols({col: new}, dict(TYPE=manager, NAME="new_" + col, SPEC=tiles if manager.startswith("Tiled") else {}))
+            tb.addcols({col: new},
+                       dict(TYPE=manager, NAME="new_" + col, SPEC=tiles if manager.startswith("Tiled") else {}))
             for row, cell in enumerate(cells):
                 if cell is not None:
                     tb.putcell(col, row, cell)
@@ -178,7 +180,8 @@ def remake(col, change, manager="StandardStMan", **description):
 
 def cells(col, rows, change, **options):
     """Return a function that changes the cells of these rows (all where None) of a column; `change` may return None."""
-    return remake(col, lambda old: [change(cell) if rows is None or row in rows else cell for row, cell in enumerate(old)],
+    return remake(col,
+                  lambda old: [change(cell) if rows is None or row in rows else cell for row, cell in enumerate(old)],
                   **options)
 
 

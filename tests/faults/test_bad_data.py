@@ -119,7 +119,8 @@ def test_a_wild_visibility_is_found_by_the_image(copy, tmp_path, flagged_model):
 @pytest.mark.parametrize("fault", HOPELESS)
 def test_nothing_to_image_is_an_error(copy, tmp_path, fault):
     HOPELESS[fault](copy)
-    assert_refused(copy, tmp_path, "datacolumn = 'data'.*zero" if fault == "all data zero" else "vis.*samples left out as")
+    assert_refused(copy, tmp_path, "datacolumn = 'data'.*zero" if fault == "all data zero"
+                   else "vis.*samples left out as")
 
 
 def test_strong_data_of_right_weights_are_believed(copy, tmp_path):
@@ -217,7 +218,8 @@ def test_phase_centres_add_up_and_must_be_one_field(vis, tmp_path):
     far = observe(tmp_path / "far.ms", fields=("J2000 03h00m00s +40d44m10s",), hour_angle=0)
     assert_refused([vis, far], tmp_path, "phasecenter = '': field 0 of '.*far.ms' is 74 degrees",
                    imagename=str(tmp_path / "none"))
-    assert_refused(vis, tmp_path, "phasecenter = 'J2000 .* is 180 degrees", phasecenter="J2000 07h59m28.5s -40d44m01.5s",
+    assert_refused(vis, tmp_path, "phasecenter = 'J2000 .* is 180 degrees",
+                   phasecenter="J2000 07h59m28.5s -40d44m01.5s",
                    imagename=str(tmp_path / "none"))
 
 
@@ -226,7 +228,8 @@ def test_phase_centres_add_up_and_must_be_one_field(vis, tmp_path):
 
 @pytest.fixture(scope="module")
 def of_broken(vis, tmp_path_factory):
-    """What tsara says of every broken MeasurementSet, in a process that may hang or die: {fault: [error, message, changed]}."""
+    """What tsara says of every broken MeasurementSet, in a process that may hang or die: {fault: [error, message,
+    changed]}."""
     folder = tmp_path_factory.mktemp("broken")
     code = f"import sys; sys.path[:0] = {[str(Path(__file__).parent), str(Path(__file__).parents[1])]!r}; " \
            f"from test_bad_data import try_all; try_all({str(vis)!r})"

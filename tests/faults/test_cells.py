@@ -1,4 +1,5 @@
-"""Cells of the main table that are not there, or of another shape: each row has its own, and is looked at before it is read."""
+"""Cells of the main table that are not there, or of another shape: each row has its own,
+and is looked at before it is read."""
 
 import shutil
 
@@ -62,11 +63,13 @@ def with_spectra(name, rows, of_others=False):
 @pytest.mark.parametrize("weighting", ["natural", "uniform", "briggs"])
 @pytest.mark.parametrize("part", ["first half", "second half", "every second"])
 def test_each_row_has_its_own_weights(two_windows, tmp_path, part, weighting):
-    """As tclean images the data with a WEIGHT_SPECTRUM in all rows: else its uniform weights mix the kinds, or it ends."""
+    """As tclean images the data with a WEIGHT_SPECTRUM in all rows: else its uniform weights mix the kinds,
+    or it ends."""
     from casatasks import tclean
 
     count = column(two_windows, "TIME").size
-    rows = {"first half": range(count // 2), "second half": range(count // 2, count), "every second": range(0, count, 2)}[part]
+    rows = {"first half": range(count // 2), "second half": range(count // 2, count),
+            "every second": range(0, count, 2)}[part]
     some, every = (shutil.copytree(two_windows, tmp_path / f"{kind}.ms") for kind in ("some", "every"))
     call = dict(imsize=128, cell="0.5arcsec", datacolumn="data", niter=0, weighting=weighting)
     tsara(vis=with_spectra(some, rows), imagename=str(tmp_path / "s"), **call)
@@ -79,7 +82,8 @@ def test_each_row_has_its_own_weights(two_windows, tmp_path, part, weighting):
 def test_a_concat_is_imaged_as_tclean_does(tmp_path):
     from casatasks import concat, tclean
 
-    names = [observe(tmp_path / "a.ms", weight_spectrum=True, noise=0.3), observe(tmp_path / "b.ms", seed=2, date="2015/06/02")]
+    names = [observe(tmp_path / "a.ms", weight_spectrum=True, noise=0.3),
+             observe(tmp_path / "b.ms", seed=2, date="2015/06/02")]
     both = str(tmp_path / "both.ms")
     _in_all_columns(names)
     concat(vis=names, concatvis=both)
@@ -164,7 +168,8 @@ def test_tables_that_consist_of_several(tmp_path):
 
 
 @pytest.mark.parametrize(("empty", "manager"), [
-    (lambda cell: None, "StandardStMan"), (lambda cell: None, "TiledShapeStMan"), (lambda cell: cell[:, :0], "StandardStMan"),
+    (lambda cell: None, "StandardStMan"), (lambda cell: None, "TiledShapeStMan"),
+    (lambda cell: cell[:, :0], "StandardStMan"),
 ], ids=["undefined", "undefined, tiled", "without elements"])
 def test_rows_without_a_cell_are_known(copy, empty, manager):
     rows = [3, ROW, 300]

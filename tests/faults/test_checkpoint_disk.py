@@ -33,7 +33,8 @@ def test_a_run_goes_on_where_the_disk_has_no_room_for_its_checkpoint(tmp_path, m
         result = tsara(vis=vis, imagename=str(disk / "source"), niter=12, **GRID)
         assert result["stopcode"] == ITERATION_LIMIT and result["iterdone"] == 12
         failed = [line for line in warned if "could not be written" in line]
-        assert [line.split(" could")[0] for line in failed] == [f"the checkpoint of iteration {k}" for k in (5, 6, 7, 8)]
+        assert [line.split(" could")[0] for line in failed] == [f"the checkpoint of iteration {k}"
+                                                                for k in (5, 6, 7, 8)]
         assert all("No space left" in line for line in failed)
         assert {path.suffix for path in disk.iterdir()} == {
             ".image", ".model", ".psf", ".residual", ".pb", ".sumwt", ".json"}

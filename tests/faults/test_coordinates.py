@@ -45,7 +45,8 @@ def brightest(name):
 
 # Poles ------------------------------------------------------------------------------------------
 
-NORTH, SOUTH, GALACTIC = "J2000 03h00m00s +90d00m00s", "J2000 03h00m00s -90d00m00s", "J2000 12h51m26.2755s +27d07m41.704s"
+NORTH, SOUTH = "J2000 03h00m00s +90d00m00s", "J2000 03h00m00s -90d00m00s"
+GALACTIC = "J2000 12h51m26.2755s +27d07m41.704s"
 POLES = {
     "north": (NORTH, ""),
     "north, ICRS": (NORTH, "ICRS 05h00m00s +90d00m00s"),
@@ -71,7 +72,8 @@ def at_pole(field):
 
 @pytest.mark.parametrize("case", POLES)
 def test_the_source_is_where_the_coordinates_say(case):
-    """tclean has it there too, but for the south poles, where it turns the image by 180 degrees against its coordinates."""
+    """tclean has it there too, but for the south poles, where it turns the image by 180 degrees against its
+    coordinates."""
     from casatasks import tclean
 
     field, phasecenter = POLES[case]
@@ -99,13 +101,15 @@ def test_a_cube_and_a_comparison_at_the_pole():
         assert found["natural"]["sigma"] < 0.02
 
 
-@pytest.mark.parametrize("mistaken", [np.diag([-1, 1, 1]), np.diag([1, -1, 1]), np.diag([-1, -1, 1]), np.eye(3)[[1, 0, 2]]])
+@pytest.mark.parametrize("mistaken",
+                         [np.diag([-1, 1, 1]), np.diag([1, -1, 1]), np.diag([-1, -1, 1]), np.eye(3)[[1, 0, 2]]])
 def test_coordinates_that_are_not_those_of_the_pixels_are_refused(monkeypatch, mistaken):
     """Whatever it is that CASA does otherwise than is foreseen here: mirrored, turned, exchanged axes."""
     vis = simulate("x.ms", antennas=6, scans=1, noise=0.1)
     monkeypatch.setattr(image_plane, "image_basis", lambda direction: mistaken @ frames.image_basis(direction))
     for mode in ("mfs", "cube"):
-        with pytest.raises(ValueError, match="phasecenter = '', projection = 'SIN': CASA's coordinates of this image differ"):
+        with pytest.raises(ValueError,
+                           match="phasecenter = '', projection = 'SIN': CASA's coordinates of this image differ"):
             tsara(vis=vis, imagename="t", niter=0, specmode=mode, **GRID)
     assert not Path("t.residual").exists()
 
@@ -181,7 +185,8 @@ def test_directions_fixed_on_earth_are_astropys(frame, site):
 
 
 def drifting(frame, site):
-    """Write an observation whose field stands still over the Earth for four seconds; return it, and the source's vector."""
+    """Write an observation whose field stands still over the Earth for four seconds; return it,
+    and the source's vector."""
     vis = simulate("h.ms", configuration="c", antennas=8, scans=1, scan_seconds=4.0, integration=1.0, hour_angle=-1.5)
     time, uvw, data = column(vis, "TIME"), column(vis, "UVW"), column(vis, "DATA")
     centre = SkyCoord("19h59m28.5s", "+40d44m02s", frame="fk5")
@@ -193,7 +198,8 @@ def drifting(frame, site):
     for moment in np.unique(time):
         at = Time(moment / 86400, format="mjd", scale="utc")
         here, where = time == moment, AltAz if frame.endswith("GEO") else HADec
-        axes = SkyCoord(*(angles * units.rad), frame=where(obstime=at, location=site[1])).transform_to(FK5(equinox="J2000"))
+        axes = SkyCoord(*(angles * units.rad),
+                        frame=where(obstime=at, location=site[1])).transform_to(FK5(equinox="J2000"))
         axes = basis(axes.ra.rad, axes.dec.rad)
         uvw[:, here] = axes @ tracked.T @ uvw[:, here]
         data[:, :, here] = np.exp(2j * np.pi * waves * ((axes @ source - [0, 0, 1]) @ uvw[:, here]))
@@ -210,11 +216,13 @@ def drifting(frame, site):
 
 @pytest.mark.parametrize("frame", ["AZELGEO", "HADEC"])
 def test_a_field_that_stands_still_over_the_earth_is_followed_on_the_sky(frame, site):
-    """tclean holds it at one place of the sky: the source has a quarter of its flux, 20 to 50 arcsec from where it is."""
+    """tclean holds it at one place of the sky: the source has a quarter of its flux,
+    20 to 50 arcsec from where it is."""
     vis, source = drifting(frame, site)
     for phasecenter in ("", "0", "J2000 19h59m28.5s +40d44m02s"):
         shutil.rmtree("t.residual", ignore_errors=True)
-        found = tsara(vis=vis, imagename="t", niter=0, phasecenter=phasecenter, overwrite=True, **GRID | dict(imsize=160))
+        found = tsara(vis=vis, imagename="t", niter=0, phasecenter=phasecenter, overwrite=True,
+                      **GRID | dict(imsize=160))
         assert np.linalg.norm(brightest("t.residual") - source) < 1.0 * ARCSEC
         assert pixels("t.residual").max() > 0.98
     assert any(f"is in {frame}: its direction on the sky is computed" in note for note in found["sara"]["notes"])
@@ -227,5 +235,6 @@ def test_the_direction_of_a_planet_is_refused_by_name(site):
 
 @pytest.mark.parametrize("phasecenter", ["TRACKFIELD", "trackfield", "MARS"])
 def test_a_phase_centre_that_moves_is_refused_by_name(phasecenter):
-    with pytest.raises(ValueError, match=f"phasecenter = '{phasecenter}': moving sources cannot be followed: it takes a field"):
+    with pytest.raises(ValueError,
+                       match=f"phasecenter = '{phasecenter}': moving sources cannot be followed: it takes a field"):
         frames.image_direction(phasecenter, [None])

@@ -1,4 +1,5 @@
-"""Correlations of every kind that hold the Stokes parameter asked for, in any order: tclean's images and model column."""
+"""Correlations of every kind that hold the Stokes parameter asked for, in any order:
+tclean's images and model column."""
 
 import shutil
 
@@ -103,7 +104,8 @@ def test_weights_are_the_inverse_variance(holding, sky, correlations, hands):
 @pytest.mark.parametrize("order", ["I Q U V", "V U Q I"])
 @pytest.mark.parametrize("stokes", "IQUV")
 def test_a_stored_stokes_parameter_is_taken_as_it_stands(holding, order, stokes):
-    """tclean's image of a stored Q, U or V is empty; the right one is that of the RR, RL, LR and LL that they are made of."""
+    """tclean's image of a stored Q, U or V is empty; the right one is that of the RR, RL,
+    LR and LL that they are made of."""
     formed, stored = holding("RR RL LR LL", "formed.ms"), holding(order, "stored.ms")
     edit(stored, "DATA", lambda data: np.einsum("sc,cfr->sfr", [SHARES[name] for name in order.split()], data))
     ours, right = (read_visibilities(Selection((name,), datacolumn="data"), stokes=stokes) for name in (stored, formed))
@@ -132,5 +134,6 @@ def test_rehearsals_and_comparisons_take_them_too(holding):
     ("Q U", "I"), ("V", "I"), ("RL LR", "I"), ("XX", "Q"), ("I V", "U"), ("RR RL", "V")])
 def test_what_is_not_there_is_refused(holding, correlations, stokes):
     names = correlations.replace(" ", ", ")
-    with pytest.raises(ValueError, match=f"stokes = '{stokes}' cannot be formed from the correlations {names} of spw 0"):
+    with pytest.raises(ValueError,
+                       match=f"stokes = '{stokes}' cannot be formed from the correlations {names} of spw 0"):
         tsara(vis=holding(correlations), imagename="x", stokes=stokes, positivity=stokes == "I", **GRID)

@@ -1,4 +1,5 @@
-"""FITS files as startmodel, mask and the images of saracompare, in the forms of other software, and the spellings of units."""
+"""FITS files as startmodel, mask and the images of saracompare, in the forms of other software,
+and the spellings of units."""
 
 import gzip
 import shutil
@@ -31,8 +32,10 @@ def vis(tmp_path_factory):
 
 def header(side=SIDE, cell=CELL, **more):
     """Return the coordinates of an image of the field, two axes."""
-    return fits.Header(dict(CTYPE1="RA---SIN", CRVAL1=299.86875, CRPIX1=side // 2 + 1.0, CDELT1=-cell / 3600, CUNIT1="deg",
-                            CTYPE2="DEC--SIN", CRVAL2=40 + 44 / 60 + 2 / 3600, CRPIX2=side // 2 + 1.0, CDELT2=cell / 3600,
+    return fits.Header(dict(CTYPE1="RA---SIN", CRVAL1=299.86875, CRPIX1=side // 2 + 1.0, CDELT1=-cell / 3600,
+                            CUNIT1="deg",
+                            CTYPE2="DEC--SIN", CRVAL2=40 + 44 / 60 + 2 / 3600, CRPIX2=side // 2 + 1.0,
+                            CDELT2=cell / 3600,
                             CUNIT2="deg", RADESYS="FK5", EQUINOX=2000.0, BUNIT="Jy/pixel") | more)
 
 
@@ -97,7 +100,8 @@ def test_any_form_of_fits_is_start_model_and_mask(vis, form):
     tsara(vis=vis, imagename="m", niter=5, mask="x.fits", **GRID)
     mask = pixels("m.mask") > 0
     assert mask[data.T > 0].all()
-    assert mask.sum() <= 35 + 13 * (form == "mirrored")  # a rim: what is interpolated counts where it is not zero, as in tclean
+    # a rim: what is interpolated counts where it is not zero, as in tclean
+    assert mask.sum() <= 35 + 13 * (form == "mirrored")
 
 
 def test_fits_on_another_grid_are_regridded_as_images_of_casa(vis):
@@ -126,7 +130,8 @@ def test_fits_serve_cubes_and_spectral_indices(vis):
     tsara(vis=vis, imagename="a", niter=3, spectralindex="alpha.fits.gz", **GRID)
     packed("b.model.fits.gz", block(value=0.02), header())
     packed("support.gz", block(), header())
-    assert set(saracompare(models=["a", "b"], support="support.gz", vis=vis, datacolumn="data")["products"]) == {"a", "b"}
+    assert set(saracompare(models=["a", "b"], support="support.gz", vis=vis, datacolumn="data")["products"]) == {"a",
+                                                                                                                 "b"}
 
 
 NOT_IMAGES = {
@@ -151,7 +156,8 @@ def test_what_is_no_image_is_refused_by_name(vis, content):
 def test_fits_without_the_sky_are_refused(vis):
     fits.writeto("x.fits", block())
     for parameter in ("startmodel", "mask"):
-        with pytest.raises(ValueError, match=f"{parameter} = 'x.fits' has the axes .*: should begin with right ascension"):
+        with pytest.raises(ValueError,
+                           match=f"{parameter} = 'x.fits' has the axes .*: should begin with right ascension"):
             tsara(vis=vis, imagename="t", niter=5, **{parameter: "x.fits"}, **GRID)
 
 
@@ -159,7 +165,8 @@ def test_fits_without_the_sky_are_refused(vis):
 
 SPELLINGS = {
     "Jy/pixel": ("Jy/pixel", "pixel-1 Jy", "Jy pixel-1", "pix-1 Jy", "JY/PIX", "JY/PIXEL", "Jy/pix", "jy/Pixel",
-                 "Jy pixel**-1", "Jy*pixel^-1", "Jy.pixel-1", "Jansky/pixel", "JY PIXEL-1", "Jy per pixel", "Jy / (pixel)",
+                 "Jy pixel**-1", "Jy*pixel^-1", "Jy.pixel-1", "Jansky/pixel", "JY PIXEL-1", "Jy per pixel",
+                 "Jy / (pixel)",
                  " Jy/pixel ", '"JY/PIX"'),
     "Jy/beam": ("Jy/beam", "Jy beam-1", "JY/BEAM", "Jy/bm", "bm-1 Jy", "Jy.beam-1", "JY BEAM-1"),
 }

@@ -1,4 +1,5 @@
-"""Correlations without a weight, unflagged: the other parallel hand is used where it is enough, and the samples are counted."""
+"""Correlations without a weight, unflagged: the other parallel hand is used where it is enough,
+and the samples are counted."""
 
 import shutil
 

@@ -59,7 +59,8 @@ def header(matrix, form, unit):
 
 def sky(east, north):
     """Return smooth sources in Jy per pixel of CELL, and a residual of a few waves in Jy/beam."""
-    model = sum(flux * np.exp(-((east - e) ** 2 + (north - n) ** 2) / 2) * CELL**2 / (2 * np.pi) for flux, e, n in SOURCES)
+    model = sum(flux * np.exp(-((east - e) ** 2 + (north - n) ** 2) / 2) * CELL**2 / (2 * np.pi)
+                for flux, e, n in SOURCES)
     return model, 0.01 * (np.cos(1.1 * east + 0.6 * north) + np.cos(0.4 * east - 0.9 * north + 1))
 
 
@@ -116,7 +117,8 @@ def test_oblique_axes_keep_fluxes_and_beams(matrix):
 
 
 def test_pictures_and_frames_are_upright():
-    """Each source is where right ascension and declination put it, whatever the axes of the first image and of a frame."""
+    """Each source is where right ascension and declination put it,
+    whatever the axes of the first image and of a frame."""
     product("u", turned(0))
     product("t", RIGHT_ANGLES["90 degrees, mirrored"])
     comparison = compare_images(Comparing(("t", "u"), frames=("t", "u")))

@@ -24,10 +24,13 @@ EXAMPLES, OF_SLOW = 6, 2
 SLOW = ("outdir", "report")  # write a report
 LONGEST_S = 30  # of one call, which takes a fraction of a second: what takes longer hangs
 
-STRINGS = ("", " ", "x", "Ünïcode ☆", "a b", "it's", 'say "hi"', "new\nline", "*", "[a]", "{x}", "-x", "~", "$HOME", "\0",
+STRINGS = ("", " ", "x", "Ünïcode ☆", "a b", "it's", 'say "hi"', "new\nline", "*", "[a]", "{x}", "-x", "~", "$HOME",
+           "\0",
            ".", "..", "%s", "1e400", "nan", "-1arcsec", "1Jy", "0", "all", "y" * 5000, "ab\udcff")
-NUMBERS = (0, 1, -1, 2, 3, 2**31, -(2**31), 2**63, 2**64, 10**30, 0.5, 1e-300, 1e300, -0.0, math.nan, math.inf, -math.inf)
-ODD = (None, True, False, b"bytes", 1j, {}, {"a": 1}, {1}, object, (), [], [[]], [[1, 2], [3, 4]], [None], [""], ["", ""],
+NUMBERS = (0, 1, -1, 2, 3, 2**31, -(2**31), 2**63, 2**64, 10**30, 0.5, 1e-300, 1e300, -0.0, math.nan, math.inf,
+           -math.inf)
+ODD = (None, True, False, b"bytes", 1j, {}, {"a": 1}, {1}, object, (), [], [[]], [[1, 2], [3, 4]], [None], [""],
+       ["", ""],
        [1, "a"], np.zeros((2, 2)), np.array([]), np.array(math.nan), np.float32(1), np.int64(3), range(3))
 NO_SLASH = st.characters(exclude_characters="/")
 
@@ -37,7 +40,8 @@ def values_of(parameter):
     ends = [end for end in (parameter.minimum, parameter.maximum) if math.isfinite(end)]
     near = [*parameter.allowed, parameter.default, *ends, *(int(end) for end in ends), *(end - 1 for end in ends),
             *(end + 1 for end in ends), *(math.nextafter(end, s * math.inf) for end in ends for s in (1, -1))]
-    one = st.one_of(st.sampled_from(STRINGS), st.sampled_from(NUMBERS), st.sampled_from(near), st.integers(), st.floats(),
+    one = st.one_of(st.sampled_from(STRINGS), st.sampled_from(NUMBERS), st.sampled_from(near), st.integers(),
+                    st.floats(),
                     st.text(NO_SLASH, max_size=8))
     return st.one_of(one, st.sampled_from(ODD), st.lists(one, max_size=3))
 
@@ -141,15 +145,18 @@ def test_saracompare_names_the_parameter_that_it_refuses(vis, models, parameter)
 
 # Paths ------------------------------------------------------------------------------------------
 
-NAMES = ("with spaces", "Ünïcode ☆", "it's", 'say "hi"', "[brackets](and) {more}", "glob*?", "-leading-dash", "semi;colon&$HOME",
-         "new\nline", "percent%s", "comma,equal=", "back\\slash", "trailing ", "#hash", "~tilde", "n" * 200)  # fmt: skip
+NAMES = ("with spaces", "Ünïcode ☆", "it's", 'say "hi"', "[brackets](and) {more}", "glob*?", "-leading-dash",
+         "semi;colon&$HOME",
+         # fmt: skip
+         "new\nline", "percent%s", "comma,equal=", "back\\slash", "trailing ", "#hash", "~tilde", "n" * 200)
 REFUSED = ("semi;colon&$HOME",)  # CASA takes $HOME for the variable
 PRODUCTS = ("model", "psf", "residual", "image", "sumwt", "pb", "sara.json")
 
 
 @pytest.mark.parametrize("name", NAMES, ids=ascii)
 def test_any_name_of_a_file_works_or_is_refused(vis, tmp_path, name):
-    """The products stand under just the name that was asked for, or the parameter is named and nothing is left behind."""
+    """The products stand under just the name that was asked for,
+    or the parameter is named and nothing is left behind."""
     folders = [("in", "out")] + [("", "")] * name.startswith(("-", "~"))
     for number, (data, images) in enumerate(folders):
         own, base = os.path.join(data, name), f"{name}{number}"

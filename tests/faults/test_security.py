@@ -21,13 +21,17 @@ MODULES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob(
 
 # Calls that run what they are given, and modules that are made for it.
 CALLS = {"eval", "exec", "compile", "__import__", "os.system", "os.popen", "os.execv", "os.execvp", "os.spawnv",
-         "runpy.run_path", "runpy.run_module", "yaml.load", "yaml.unsafe_load", "numba.core.serialize", "tempfile.mktemp"}
-IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve", "joblib", "cloudpickle", "subprocess", "pty", "ctypes.util",
+         "runpy.run_path", "runpy.run_module", "yaml.load", "yaml.unsafe_load", "numba.core.serialize",
+         "tempfile.mktemp"}
+IMPORTS = {"pickle", "cPickle", "dill", "marshal", "shelve", "joblib", "cloudpickle", "subprocess", "pty",
+           "ctypes.util",
            "runpy", "code", "xmlrpc", "telnetlib"}
 EXCEPTIONS = {
     ("parallel/mpi.py", "pickle"): "an error of its own is packed and unpacked, to see whether mpi4py can send it",
-    ("casa/runtime/child_process.py", "subprocess"): "this Python, told a function of casa_sara and its arguments by JSON",
-    ("reconstruction/compile_cache.py", "subprocess"): "this Python, with a fixed text that compiles the kernels of the dictionary",
+    ("casa/runtime/child_process.py",
+     "subprocess"): "this Python, told a function of casa_sara and its arguments by JSON",
+    ("reconstruction/compile_cache.py",
+     "subprocess"): "this Python, with a fixed text that compiles the kernels of the dictionary",
     ("private/shelltask.py", "runpy"): "tget runs what tput saved, as CASA's own tasks do",
     ("private/shelltask.py", "runpy.run_path"): "tget runs what tput saved, as CASA's own tasks do",
 }
@@ -56,7 +60,8 @@ def dangers(source):
             if name.split(".")[-1] == "load" and name.split(".")[0] in ("np", "numpy"):
                 safe = isinstance(words.get("allow_pickle"), ast.Constant) and words["allow_pickle"].value is False
                 found |= set() if safe else {name}
-            if not (isinstance(words.get("shell"), (ast.Constant, type(None))) and not getattr(words.get("shell"), "value", 0)):
+            if not (isinstance(words.get("shell"), (ast.Constant, type(None)))
+                    and not getattr(words.get("shell"), "value", 0)):
                 found.add("shell=")
     return found
 
@@ -69,7 +74,8 @@ def test_nothing_runs_what_it_is_given(module):
 
 @pytest.mark.parametrize("source", [
     "import pickle", "from pickle import loads", "eval(x)", "import os; os.system(x)", "import numpy as np; np.load(x)",
-    "import numpy as np; np.load(x, allow_pickle=True)", "run(x, shell=True)", "run(x, shell=y)", "from os import system",
+    "import numpy as np; np.load(x, allow_pickle=True)", "run(x, shell=True)", "run(x, shell=y)",
+    "from os import system",
     "exec(x)", "import subprocess",
 ])  # fmt: skip
 def test_the_search_finds_what_it_is_for(source):
@@ -90,7 +96,8 @@ HOSTILE = [
     [], 3, "text", None, True,
     {"history": 3}, {"history": {"iteration": "no list"}}, {"history": {"rel_change": [1, 2]}},
     {"history": {"iteration": [1, "a"], "rel_change": [1, 2]}}, {"history": {"iteration": [1], "rel_change": [1, 2]}},
-    {"history": {"iteration": [1, 2], "rel_change": [{}, []]}}, {"history": {"iteration": [[1], [2]], "rel_change": [1, 2]}},
+    {"history": {"iteration": [1, 2], "rel_change": [{}, []]}},
+    {"history": {"iteration": [[1], [2]], "rel_change": [1, 2]}},
     {"bounds": [{}]}, {"bounds": 3}, {"bounds": [{"iteration": 1, "l2_bounds": "a"}]},
     {"bounds": [{"iteration": 0, "l2_bounds": [1]}, {"iteration": 1, "l2_bounds": [1, 2]}]},
     {"reweightings": [{}]}, {"reweightings": {"iteration": 1}},
@@ -98,11 +105,14 @@ HOSTILE = [
     {"wild": 3}, {"wild": "text"},
 ]  # fmt: skip
 RIGHT = {
-    "history": {name: [1, 2] for name in ("iteration", "reweighting", "rel_change", "residual_norm", "model_flux", "model_max")},
+    "history": {name: [1, 2]
+                for name in ("iteration", "reweighting", "rel_change", "residual_norm", "model_flux", "model_max")},
     "bounds": [{"iteration": 0, "l2_bounds": [1.0]}, {"iteration": 2, "l2_bounds": [0.5]}],
     "reweightings": [{"iteration": 1, "scale": 1.0}],
-    "blocks": [{"ms": "a.ms", "observations": [0], "scans": [1], "start_mjd_s": 5e9, "end_mjd_s": 5e9 + 60, "samples": 10,
-                "noise_measured": "NaN", "l2_bound": 1.0, "residual_norm": 1.0, "noise_found": 1.0, "nnls_residual_norm": 1.0}],
+    "blocks": [{"ms": "a.ms", "observations": [0], "scans": [1], "start_mjd_s": 5e9, "end_mjd_s": 5e9 + 60,
+                "samples": 10,
+                "noise_measured": "NaN", "l2_bound": 1.0, "residual_norm": 1.0, "noise_found": 1.0,
+                "nnls_residual_norm": 1.0}],
     "wild": [],
 }
 
@@ -140,7 +150,8 @@ def test_a_record_of_tsara_is_taken_and_every_broken_one_refused(tmp_path):
                 refused += 1
         inner = entries[0] if isinstance(entries, list) and entries else entries
         for key in inner:
-            for broken in ({other: inner[other] for other in inner if other != key}, inner | {key: "text"}, inner | {key: {}}):
+            for broken in ({other: inner[other] for other in inner if other != key}, inner | {key: "text"},
+                           inner | {key: {}}):
                 record = RIGHT | {name: [broken] if isinstance(entries, list) else broken}
                 try:
                     record = read_record(written(tmp_path / "x.sara.json", record))

@@ -1,4 +1,5 @@
-"""Subtables with what CASA does not bear, telescopes without a beam, and many MeasurementSets: images, or an error of ours."""
+"""Subtables with what CASA does not bear, telescopes without a beam, and many MeasurementSets: images,
+or an error of ours."""
 
 import glob
 import json
@@ -83,7 +84,8 @@ def ephemeris(name):
     """Say that the field moves as a table says."""
     tb = casatools.table()
     tb.open(os.path.join(name, "FIELD"), nomodify=False)
-    tb.addcols({"EPHEMERIS_ID": {key: value for key, value in tb.getcoldesc("SOURCE_ID").items() if "Manager" not in key}})
+    tb.addcols({"EPHEMERIS_ID": {key: value
+                                 for key, value in tb.getcoldesc("SOURCE_ID").items() if "Manager" not in key}})
     tb.putcol("EPHEMERIS_ID", np.zeros(tb.nrows(), int))
     tb.close()
 
@@ -91,7 +93,8 @@ def ephemeris(name):
 def telescope(name, diameter_m=None, antenna=...):
     """Return a function that renames the telescope, and changes the diameter of its antennas."""
     rename = within("OBSERVATION", lambda path: edit(path, "TELESCOPE_NAME", lambda old: np.full(old.size, name)))
-    return rename if diameter_m is None else all_of(rename, within("ANTENNA", put("DISH_DIAMETER", antenna, diameter_m)))
+    return rename if diameter_m is None else all_of(rename,
+                                                    within("ANTENNA", put("DISH_DIAMETER", antenna, diameter_m)))
 
 
 TEXTS = {"ANTENNA": "NAME STATION", "FIELD": "NAME CODE", "HISTORY": "MESSAGE",
@@ -119,18 +122,23 @@ NAMED = {  # name: (what spoils, the subtable and column that the error names)
     "no ANTENNA": (without("ANTENNA"), "ANTENNA"),
     "no HISTORY": (without("HISTORY"), "HISTORY"),
     "no SOURCE": (without("SOURCE"), "SOURCE"),
-    "correlations of single precision": (within("POLARIZATION", remake("CORR_TYPE", lambda old: [1.0 * cell for cell in old],
-                                                                        valueType="float")), "POLARIZATION/CORR_TYPE holds"),
+    "correlations of single precision": (within("POLARIZATION",
+                                                remake("CORR_TYPE", lambda old: [1.0 * cell for cell in old],
+                                                                        valueType="float")),
+                                         "POLARIZATION/CORR_TYPE holds"),
     "no column NAME": (lacking("NAME", "FIELD"), "FIELD has no column NAME"),
-    "CHAN_FREQ of single precision": (within("SPECTRAL_WINDOW", remake("CHAN_FREQ", lambda old: old, valueType="float")),
+    "CHAN_FREQ of single precision": (within("SPECTRAL_WINDOW",
+                                             remake("CHAN_FREQ", lambda old: old, valueType="float")),
                                       "SPECTRAL_WINDOW/CHAN_FREQ holds float arrays: should be double arrays"),
-    "CHAN_FREQ undefined": (first("SPECTRAL_WINDOW", "CHAN_FREQ", lambda cell: None), "SPECTRAL_WINDOW/CHAN_FREQ of row 0"),
+    "CHAN_FREQ undefined": (first("SPECTRAL_WINDOW", "CHAN_FREQ", lambda cell: None),
+                            "SPECTRAL_WINDOW/CHAN_FREQ of row 0"),
     "CHAN_WIDTH too long": (first("SPECTRAL_WINDOW", "CHAN_WIDTH", lambda cell: np.tile(cell, 2)),
                             "SPECTRAL_WINDOW/CHAN_WIDTH of row 0"),
     "NUM_CHAN 5": (within("SPECTRAL_WINDOW", put("NUM_CHAN", 0, 5)), "SPECTRAL_WINDOW/NUM_CHAN of row 0 holds 5"),
     "unknown frame": (within("SPECTRAL_WINDOW", put("MEAS_FREQ_REF", 0, 77)),
                       "SPECTRAL_WINDOW/MEAS_FREQ_REF of row 0 holds 77"),
-    "CORR_TYPE one too few": (first("POLARIZATION", "CORR_TYPE", lambda cell: cell[:1]), "POLARIZATION/NUM_CORR of row 0"),
+    "CORR_TYPE one too few": (first("POLARIZATION", "CORR_TYPE", lambda cell: cell[:1]),
+                              "POLARIZATION/NUM_CORR of row 0"),
     "PHASE_DIR flat": (first("FIELD", "PHASE_DIR", lambda cell: cell[:, 0]), "FIELD/PHASE_DIR of row 0"),
     "spectral window beyond the table": (within("DATA_DESCRIPTION", put("SPECTRAL_WINDOW_ID", 0, 3)),
                                          "DATA_DESCRIPTION/SPECTRAL_WINDOW_ID of row 0 holds 3"),
@@ -166,7 +174,8 @@ def residual(vis, folder=".", **changes):
 def outcomes(vis, tmp_path_factory):
     """What tsara makes of every case, in a process that may die: {name: [largest difference, message, changed]}."""
     here = Path(__file__).parent
-    code = f"import sys; sys.path[:0] = {[str(here), str(here.parent)]!r}; from test_subtables import try_all; try_all({vis!r})"
+    code = (f"import sys; sys.path[:0] = {[str(here), str(here.parent)]!r}; "
+            f"from test_subtables import try_all; try_all({vis!r})")
     with subprocess.Popen([sys.executable, "-c", code], cwd=tmp_path_factory.mktemp("cases"), stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL) as process:
         try:

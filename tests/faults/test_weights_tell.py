@@ -1,4 +1,5 @@
-"""What is weighed least does not decide what is impossible, and neither do the order of the rows or how they are read."""
+"""What is weighed least does not decide what is impossible, and neither do the order of the rows or how they are
+read."""
 
 import shutil
 import threading
@@ -74,18 +75,21 @@ def read(*names):
 def samples(data):
     """Return what there is of each sample that was kept, in an order of its own."""
     rows, row = data.rows, data.row
-    table = np.column_stack([rows.time[row], rows.antenna1[row], rows.antenna2[row], data.chan, data.vis.real, data.vis.imag,
+    table = np.column_stack([rows.time[row], rows.antenna1[row], rows.antenna2[row], data.chan, data.vis.real,
+                             data.vis.imag,
                              data.weight, data.imaging_weight])
     return table[np.lexsort(table.T[3::-1])]
 
 
-@pytest.mark.parametrize("share, which", [(0.6, "at random"), (0.9, "at random"), (0.9, "the first ones"), (0.7, "by antenna")])
+@pytest.mark.parametrize("share, which",
+                         [(0.6, "at random"), (0.9, "at random"), (0.9, "the first ones"), (0.7, "by antenna")])
 @pytest.mark.parametrize("factor", [1e-5, 1e-8, 1e-14, 1e-30])
 def test_no_good_sample_is_left_out(copy, share, which, factor):
     junk = junk_rows(copy, which, share)
     add_junk(copy, junk, factor)
     data = read(copy)
-    assert {"impossible weight", "impossible data"}.isdisjoint(data.dropped) or factor == 1e-30  # where the junk itself is
+    # where the junk itself is
+    assert {"impossible weight", "impossible data"}.isdisjoint(data.dropped) or factor == 1e-30
     assert np.count_nonzero(~junk[data.rows.row[data.row]]) == 3 * np.count_nonzero(~junk)
 
 
@@ -126,7 +130,8 @@ def test_neither_order_nor_pieces_nor_measurement_sets_matter(copy, tmp_path, mo
     order = np.random.default_rng(3).permutation(junk.size)
     ways = {"shuffled": [rewritten(copy, order, tmp_path / "shuffled.ms")],
             "junk first": [rewritten(copy, np.argsort(~junk, kind="stable"), tmp_path / "first.ms")],
-            "apart": [rewritten(copy, np.flatnonzero(junk == which), tmp_path / f"{which}.ms") for which in (False, True)]}
+            "apart": [rewritten(copy, np.flatnonzero(junk == which), tmp_path / f"{which}.ms")
+                      for which in (False, True)]}
     for chunk in (150, 10**7):
         monkeypatch.setattr(reader, "_CHUNK", chunk)
         for way, names in (ways | {"as it was": [copy]}).items():
@@ -187,7 +192,8 @@ def test_ranks_do_not_matter(copy):
 @pytest.mark.parametrize("which", ["row", "baseline", "antenna"])
 def test_weights_far_above_all_others_are_of_a_few_or_of_one_antenna(copy, which):
     one, other = column(copy, "ANTENNA1"), column(copy, "ANTENNA2")
-    heavy = {"row": np.arange(one.size) == 11, "baseline": (one == 2) & (other == 5), "antenna": (one == 4) | (other == 4)}[which]
+    heavy = {"row": np.arange(one.size) == 11, "baseline": (one == 2) & (other == 5),
+             "antenna": (one == 4) | (other == 4)}[which]
     edit(copy, "WEIGHT", lambda weight: np.where(heavy, 1e12 * weight, weight))
     assert read(copy).dropped == {"impossible weight": 3 * np.count_nonzero(heavy)}
 

@@ -22,8 +22,8 @@ def is_fits(name):
 def readable(name):
     """Yield the name of an image that CASA can read: this one, or for a FITS file that it cannot, a temporary copy.
 
-    CASA reads the primary array and the first extension, uncompressed, and fails where CROTA turns the axes by 90 degrees;
-    of other files the copy holds the first image, with a PC matrix for CROTA.
+    CASA reads the primary array and the first extension, uncompressed, and fails where CROTA turns the axes by 90
+    degrees; of other files the copy holds the first image, with a PC matrix for CROTA.
 
     Raises
     ------
@@ -40,7 +40,8 @@ def readable(name):
             number, image = next((k, hdu) for k, hdu in enumerate(hdus) if hdu.is_image and len(hdu.shape) > 1)
             turned = any(image.header.get(key) for key in image.header["CROTA*"])
             packed = number > 1 or turned or isinstance(image, fits.CompImageHDU) or _beginning(name) != _FITS
-            data, header = (image.data, _with_matrix(image.header) if turned else image.header) if packed else (None, None)
+            header = _with_matrix(image.header) if turned else image.header
+            data, header = (image.data, header) if packed else (None, None)
     except StopIteration:
         raise RuntimeError("the FITS file holds no image of two axes or more") from None
     except Exception as error:  # of many kinds, from the parser

@@ -150,9 +150,9 @@ def _check_coordinates(csys, center, grid):
     labelled = unit_vectors(*tool.toworldmany(pixels)["numeric"][:2])
     apart = float(np.linalg.norm(imaged - labelled, axis=0).max() / cell.min())
     if not apart < _LARGEST_OFFSET:
-        raise ValueError(f"phasecenter = '{grid.phasecenter}', projection = '{grid.projection}': CASA's coordinates of this "
-                         f"image differ from the places of its pixels by up to {apart:.3g} pixels: should be another "
-                         "phasecenter, as 'J2000 19h59m28.5s +40d44m02s'")
+        raise ValueError(f"phasecenter = '{grid.phasecenter}', projection = '{grid.projection}': CASA's coordinates of "
+                         f"this image differ from the places of its pixels by up to {apart:.3g} pixels: should be "
+                         "another phasecenter, as 'J2000 19h59m28.5s +40d44m02s'")
 
 
 def read_pixels(ia, getmask=False, number=0):
@@ -185,8 +185,8 @@ def slabs(nx, ny):
 def _make_primary_beam(visibilities, selection, grid, root, diameters=False):
     """Write the image `root`.pb, not normalised yet, with synthesisimager, and return whether it could.
 
-    Of a telescope without a model of its beam and without the diameter of its first antenna, CASA makes none unless it is
-    told of `diameters`.
+    Of a telescope without a model of its beam and without the diameter of its first antenna, CASA makes none unless it
+    is told of `diameters`.
 
     Its partner synthesisnormalizer would do that, but now and then the two tools overwrite
     each other's pixels.
@@ -203,7 +203,8 @@ def _make_primary_beam(visibilities, selection, grid, root, diameters=False):
             imager.defineimage(_image_record(visibilities, grid, root), {"gridder": "standard", "imagename": root})
         except RuntimeError as error:
             parameters = f"{_axes_words(grid)}, vis = {list(selection.vis)}"
-            raise ValueError(f"{parameters}: CASA cannot make an image of them: {' '.join(str(error).split())}") from error
+            raise ValueError(f"{parameters}: CASA cannot make an image of them: "
+                         f"{' '.join(str(error).split())}") from error
         imager.makepb()
     finally:
         imager.done()

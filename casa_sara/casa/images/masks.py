@@ -39,8 +39,8 @@ def read_support(grid, plane):
     if grid.usemask == "pb":
         support = plane.pb > grid.pbmask
         if not support.any():
-            raise ValueError(f"usemask = 'pb', pbmask = {grid.pbmask:g}: the primary beam is nowhere in the image above this "
-                             "value: should be less, or the image closer to the pointing centre")
+            raise ValueError(f"usemask = 'pb', pbmask = {grid.pbmask:g}: the primary beam is nowhere in the image "
+                             "above this value: should be less, or the image closer to the pointing centre")
         return support
     if not grid.mask:
         return None
@@ -49,9 +49,10 @@ def read_support(grid, plane):
         found = _mask_of(entry, plane) & ((plane.pb > grid.pbmask) | (grid.pbmask == 0))
         if not found.any():
             limits = f", pbmask = {grid.pbmask:g}" if grid.pbmask else ""
-            raise ValueError(f"mask = '{entry}'{limits} selects no pixel: should be a CRTF region as 'circle[[40pix,40pix],"
-                             "10pix]', a file of them that begins with #CRTF, or an image of ones and zeros, CASA's or FITS, "
-                             f"with something in it inside this image of {list(plane.shape)} pixels; '' is no mask")
+            raise ValueError(f"mask = '{entry}'{limits} selects no pixel: should be a CRTF region as "
+                             "'circle[[40pix,40pix],10pix]', a file of them that begins with #CRTF, or an image of "
+                             f"ones and zeros, CASA's or FITS, with something in it inside this image of "
+                             f"{list(plane.shape)} pixels; '' is no mask")
         support |= found
     return support
 

@@ -79,8 +79,8 @@ def new_products(imagename):
     """Yield the name under which to write the products; they take their places when all are complete.
 
     Those of an older run are replaced, all together; when something fails, everything stays as it was. The folder
-    of the report, where others may have put files, is left to who writes reports. No name of another run can give one of the
-    folders in which products wait (:mod:`casa_sara.runtime.atomic`).
+    of the report, where others may have put files, is left to who writes reports. No name of another run can give one
+    of the folders in which products wait (:mod:`casa_sara.runtime.atomic`).
     """
     with new_files(imagename, lambda: _older(imagename)) as new:
         yield os.path.join(new, os.path.basename(imagename))
@@ -124,13 +124,15 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
-            in_child(write_images, child, root=root, plane=vars(plane), images=images, sumwt=np.asarray(sumwt, np.float32),
+            in_child(write_images, child, root=root, plane=vars(plane), images=images,
+                     sumwt=np.asarray(sumwt, np.float32),
                      beam=beam, restoringbeam=output.restoringbeam, history=output.history, pbcor=output.pbcor)
             if record is not None:
                 jsonfile.save(root + RECORD, record)
             sync(os.path.dirname(root))
         except (ChildError, OSError) as error:
-            raise _not_written(output.imagename, _bytes_needed(plane.pb.shape, more), os.path.dirname(root), error) from error
+            raise _not_written(output.imagename, _bytes_needed(plane.pb.shape, more), os.path.dirname(root),
+                               error) from error
 
 
 def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor=False):

@@ -28,9 +28,11 @@ def read_record(path: str | os.PathLike) -> dict[str, Any]:
         _check_history(record.get("history") or {})
         for name in ("bounds", "reweightings", "blocks", "wild"):
             entries = record.get(name) or []
-            _check(isinstance(entries, list) and all(isinstance(entry, dict) for entry in entries), name, "a list of records")
+            _check(isinstance(entries, list) and all(isinstance(entry, dict) for entry in entries), name,
+                   "a list of records")
             for entry in entries:
-                _check(name not in ("bounds", "reweightings") or _are_numbers(entry.get("iteration")), name, "of iterations")
+                _check(name not in ("bounds", "reweightings") or _are_numbers(entry.get("iteration")), name,
+                       "of iterations")
         _check_bounds(record.get("bounds") or [])
         for block in record.get("blocks") or []:
             _check_block(block)
@@ -71,4 +73,5 @@ def _check_block(block):
         return
     _check(_are_numbers(*map(block.get, _OF_BLOCK)), "blocks", "of " + ", ".join(_OF_BLOCK))
     times = block["start_mjd_s"], block["end_mjd_s"]
-    _check(all(0 <= time < _LATEST_S for time in times) and math.isfinite(block["noise_found"]), "blocks", "of this age")
+    _check(all(0 <= time < _LATEST_S for time in times) and math.isfinite(block["noise_found"]), "blocks",
+           "of this age")

@@ -16,7 +16,8 @@ _SAME_SIZE = 1e-2  # pixels over a whole image, below which pixel sizes are the 
 class PixelMap:
     """The positions of the pixels of one image in the pixels of another.
 
-    Another frame of directions is reached by the rotation that is right at the image's reference, at the date of the other.
+    Another frame of directions is reached by the rotation that is right at the image's reference, at the date of the
+    other.
 
     Parameters
     ----------

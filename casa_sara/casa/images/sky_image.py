@@ -55,7 +55,7 @@ class SkyPlane:
 
     @property
     def _steps(self):
-        """Steps to the east and to the north (rows) of one pixel along x and along y (columns), rad, before projection."""
+        """Steps to the east and north (rows) of one pixel along x and y (columns), rad, before projection."""
         sky = self.csys["direction0"]
         return np.asarray(sky["cdelt"])[:, None] * np.asarray(sky["pc"]).T  # CASA's record has PC transposed
 
@@ -78,8 +78,8 @@ class SkyPlane:
     def upright(self) -> SkyPlane:
         """Return the plane that shows all of this one with x to the west and y to the north, in SIN projection.
 
-        It is this very plane where that is so already. Of one that is mirrored or turned by right angles, each pixel is a
-        pixel of the new one.
+        It is this very plane where that is so already. Of one that is mirrored or turned by right angles, each pixel is
+        a pixel of the new one.
         """
         # which axis runs along the new x, which along y, and whether backwards
         steps = self._steps * [[-1], [1]]
@@ -101,7 +101,8 @@ class SkyPlane:
         import casatools
 
         axes = {"projection": "SIN", "projection_parameters": np.zeros(2), "crval": np.array(centre, float),
-                "crpix": np.array([n // 2 for n in shape], float), "cdelt": np.array([-cell[0], cell[1]]), "pc": np.eye(2),
+                "crpix": np.array([n // 2 for n in shape], float), "cdelt": np.array([-cell[0], cell[1]]),
+                "pc": np.eye(2),
                 "longpole": _BY_STANDARD, "latpole": _BY_STANDARD}
         csys = casatools.coordsys()
         csys.fromrecord(self.csys | {"direction0": self.csys["direction0"] | axes})
@@ -163,7 +164,8 @@ class SkyImage:
     def upright(self) -> SkyImage:
         """Return this Jy/pixel image with x to the west and y to the north (see :meth:`SkyPlane.upright`)."""
         plane = self.plane.upright()
-        return self if plane is self.plane else replace(self, pixels=self.flux_on(plane).astype(np.float32), plane=plane)
+        return self if plane is self.plane else replace(self, pixels=self.flux_on(plane).astype(np.float32),
+                                                        plane=plane)
 
 
 def read_sky_image(name, parameter, units):
@@ -207,7 +209,8 @@ def read_sky_image(name, parameter, units):
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
-    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]), _parameters(history))
+    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]),
+                    _parameters(history))
 
 
 def read_header(name):

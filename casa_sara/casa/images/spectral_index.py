@@ -24,8 +24,8 @@ def check_spectral_index(text):
         raise FileNotFoundError(f"spectralindex = '{text}' is neither a number nor an image that exists: should be the "
                                 "exponent of the frequency, as '-0.7', or an image of it")
     if value is not None and not abs(value) <= LARGEST_INDEX:
-        raise ValueError(f"spectralindex = '{text}': should be from {-LARGEST_INDEX:g} to {LARGEST_INDEX:g}, the exponent "
-                         "of the frequency, as '-0.7'")
+        raise ValueError(f"spectralindex = '{text}': should be from {-LARGEST_INDEX:g} to {LARGEST_INDEX:g}, the "
+                         "exponent of the frequency, as '-0.7'")
 
 
 def with_spectrum(grid, plane, reference=None):
@@ -58,7 +58,7 @@ def with_spectrum(grid, plane, reference=None):
 
 
 def spectral_band(grid, freq_range_hz):
-    """Return the largest |ln(ν/ν0)| where an image of the spectral index is given, else 0, for the forecast of memory."""
+    """Return the largest |ln(ν/ν0)| where an image of the spectral index is given, else 0: for the memory forecast."""
     if not grid.spectralindex or _number(grid.spectralindex) is not None or not min(freq_range_hz) > 0:
         return 0.0
     reference = hertz(grid.reffreq, "reffreq") if grid.reffreq else sum(freq_range_hz) / 2
@@ -88,7 +88,8 @@ def _index_image(name, plane):
     with opened_image(name) as ia:
         good = read_pixels(ia, getmask=True)
     if not good.any() or not image.overlaps(plane):
-        raise ValueError(f"spectralindex = '{name}' has no valid pixel in the image: should cover the same part of the sky")
+        raise ValueError(f"spectralindex = '{name}' has no valid pixel in the image: should cover the same part of the "
+                         "sky")
     low, high = float(image.pixels[good].min()), float(image.pixels[good].max())
     if max(-low, high) > LARGEST_INDEX:
         raise ValueError(f"spectralindex = '{name}' has values from {low:.3g} to {high:.3g}: should be from "

@@ -8,7 +8,8 @@ import warnings
 __all__ = ["brightness_unit"]
 
 UNITS = ("Jy/pixel", "Jy/beam", "Jy/sr", "")
-_WORDS = {"jy": "Jy", "jansky": "Jy", "janskys": "Jy", "pixel": "pixel", "pixels": "pixel", "pix": "pixel", "px": "pixel",
+_WORDS = {"jy": "Jy", "jansky": "Jy", "janskys": "Jy", "pixel": "pixel", "pixels": "pixel", "pix": "pixel",
+          "px": "pixel",
           "beam": "beam", "beams": "beam", "bm": "beam", "sr": "sr", "per": "/"}
 
 

@@ -14,12 +14,12 @@ from casa_sara.parallel.serial import SERIAL
 __all__ = ["divide", "parsed"]
 
 _WORD = re.compile(r"(?:^|\s+)(" + "|".join(("vis", *MSSELECT_KEYS)) + r")\s*=")
-RIGHT = ("should be a number, or a list of entries as 'scan=3', 'spw=1', 'timerange=09:14:00~09:20:00' or 'vis=0 scan=3' "
-         f"(vis, the number of the MeasurementSet, and {', '.join(MSSELECT_KEYS)})")
+RIGHT = ("should be a number, or a list of entries as 'scan=3', 'spw=1', 'timerange=09:14:00~09:20:00' or 'vis=0 "
+         f"scan=3' (vis, the number of the MeasurementSet, and {', '.join(MSSELECT_KEYS)})")
 
 
 def divide(visibilities, blocks, comm=SERIAL):
-    """Divide the samples into blocks: by snapshots, into a number of blocks, or separately for the selections of the user.
+    """Divide the samples into blocks: by snapshots, into a number of blocks, or separately for given selections.
 
     The samples of an entry, and the rest, are split into snapshots each by itself. Where entries overlap the first has
     the samples.
@@ -51,8 +51,8 @@ def divide(visibilities, blocks, comm=SERIAL):
                              f"blocks = '{entry}' selects no visibility that is imaged: {RIGHT}")
         found &= group == 0
         if not comm.total(int(found.sum())):
-            raise ValueError(f"blocks = '{entry}' selects only visibilities that earlier entries have selected: leave it "
-                             "out, or put it first")
+            raise ValueError(f"blocks = '{entry}' selects only visibilities that earlier entries have selected: leave "
+                             "it out, or put it first")
         group[found] = number
     return snapshot_blocks(visibilities, group=group, comm=comm)
 
@@ -82,7 +82,7 @@ def _numbers(entry, text):
 
 
 def _samples_of(visibilities, entry):
-    """Return which samples an entry selects, bool (M,), and the errors of MeasurementSets to which it does not apply."""
+    """Return which samples an entry selects, bool (M,), and the errors of MeasurementSets that it does not fit."""
     words = parsed(entry)
     wanted = _numbers(entry, words.pop("vis")) if "vis" in words else list(visibilities.spws)
     rows, found, refusals = visibilities.rows, np.zeros(visibilities.size, bool), []

@@ -79,7 +79,8 @@ def _unflagged(tb, rows, group):
         some = rows[start : start + step]
         part = tb.selectrows(some.tolist())
         try:
-            flag = np.any(read_slice(part, "FLAG", group.has("FLAG", some), low, high, bool), axis=0)[group.channels - first]
+            flag = np.any(read_slice(part, "FLAG", group.has("FLAG", some), low, high, bool),
+                          axis=0)[group.channels - first]
             count += np.count_nonzero(~(flag | part.getcol("FLAG_ROW")))
         finally:
             part.close()

@@ -84,7 +84,7 @@ def on_sky(direction, ms, time_s):
 
 
 def _as_kept(direction):
-    """Return a direction with the latitude of CASA's coordinates: these keep unit vectors, so near a pole it is rounded."""
+    """Return a direction with the latitude of CASA's coordinates: kept as unit vectors, it is rounded near a pole."""
     longitude, latitude = (direction[axis]["value"] for axis in ("m0", "m1"))
     return direction_measure(direction["refer"], longitude, np.arcsin(np.sin(latitude)))
 
@@ -97,8 +97,8 @@ def _direction_of(phasecenter, first):
     if text.isdigit():
         return _field_direction(int(text), first)
     if text.upper() in ("TRACKFIELD", *_OF_OBJECTS):
-        raise ValueError(f"phasecenter = '{phasecenter}': moving sources cannot be followed: it takes a field number or a "
-                         "direction on the sky")
+        raise ValueError(f"phasecenter = '{phasecenter}': moving sources cannot be followed: it takes a field number "
+                         "or a direction on the sky")
     words = text.split()
     if len(words) == 2:
         words.insert(0, "J2000")
@@ -179,8 +179,8 @@ def image_basis(direction):
 def _converted(vector, frame, target, epoch_s):
     """Return a unit vector of one direction frame in another one, at a time (MJD seconds, UTC) where it matters.
 
-    CASA's matrices are unitary to 1e-11, and its latitude is the arcsine of the third component: within δ of a pole it is
-    wrong by 1e-11/δ, or NaN. There the mean of four vectors around is taken.
+    CASA's matrices are unitary to 1e-11, and its latitude is the arcsine of the third component: within δ of a pole it
+    is wrong by 1e-11/δ, or NaN. There the mean of four vectors around is taken.
     """
     me = _measures()
     if epoch_s is not None:
@@ -313,13 +313,14 @@ class Geometry:
         return rotated[:, :, None] * wave_number, shift
 
     def _turns(self, field, time):
-        """Yield the rows (bool) of each field, and of each time where it moves on the sky, with their `rotation_between`."""
+        """Yield the rows (bool) of each field, and of each time where it moves on the sky, with `rotation_between`."""
         for number in np.unique(field).tolist():
             of_field, centre = field == number, self._ms.fields[number]
             times = np.unique(time[of_field]).tolist() if is_of_earth(centre) else [self._ms.start_s]
             for at in times:
                 if (number, at) not in self._rotations:
-                    self._rotations[number, at] = rotation_between(on_sky(centre, self._ms, at), self._image, self._ms.start_s)
+                    self._rotations[number, at] = rotation_between(on_sky(centre, self._ms, at), self._image,
+                                                                   self._ms.start_s)
                 yield of_field & (time == at) if len(times) > 1 else of_field, self._rotations[number, at]
 
     def frequencies(self, group, field, time):

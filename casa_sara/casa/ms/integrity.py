@@ -17,7 +17,8 @@ _LATEST_S = 1e11  # MJD seconds, in the year 5000
 _NEEDED = {"UVW", "ANTENNA1", "DATA_DESC_ID", "FLAG"}
 # of the main table, as CASA asks for them: type → columns; those with axes
 _REQUIRED = {
-    "int": ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "DATA_DESC_ID", "FEED1", "FEED2", "FIELD_ID", "OBSERVATION_ID", "PROCESSOR_ID",
+    "int": ("ANTENNA1", "ANTENNA2", "ARRAY_ID", "DATA_DESC_ID", "FEED1", "FEED2", "FIELD_ID", "OBSERVATION_ID",
+            "PROCESSOR_ID",
             "SCAN_NUMBER", "STATE_ID"),
     "double": ("EXPOSURE", "INTERVAL", "TIME", "TIME_CENTROID", "UVW"),
     "boolean": ("FLAG", "FLAG_CATEGORY", "FLAG_ROW"),
@@ -42,7 +43,8 @@ def check_measurement_set(name):
     """Raise unless `name` is a MeasurementSet with rows, whose numbers do not make CASA crash.
 
     msmetadata ends the process at a frequency that is no number, and never returns from such a time. Subtables with
-    something wrong are set right in a copy (:func:`casa_sara.casa.ms.subtables.readable`), or refused where all is wrong.
+    something wrong are set right in a copy (:func:`casa_sara.casa.ms.subtables.readable`), or refused where all is
+    wrong.
 
     Raises
     ------
@@ -63,7 +65,8 @@ def check_measurement_set(name):
     except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"vis = '{name}' cannot be opened as a table: {error}") from error
     if missing:
-        raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet: it has no column {', '.join(missing)}")
+        raise ValueError(f"vis = '{name}' is a CASA table, but not a MeasurementSet: it has no column "
+                         f"{', '.join(missing)}")
     if rows == 0:
         raise ValueError(f"vis = '{name}' is a MeasurementSet without rows")
     with reading(name), opened("table", name) as tb:
@@ -75,7 +78,8 @@ def check_measurement_set(name):
 def _check_columns(tb, name):
     """Raise unless the columns of the main table are those that CASA requires."""
     there = tb.getdesc()
-    for kind, column in [(kind, one) for kinds in (_REQUIRED, _OPTIONAL) for kind, names in kinds.items() for one in names]:
+    for kind, column in [(kind, one) for kinds in (_REQUIRED, _OPTIONAL) for kind, names in kinds.items()
+                         for one in names]:
         if column not in there:
             if column in _REQUIRED.get(kind, ()):
                 raise ValueError(f"vis = '{name}' has no column {column}, which every MeasurementSet has")
@@ -111,7 +115,8 @@ def _check_numbers(name):
     with opened("table", name) as tb:
         time, interval, field = (tb.getcol(column) for column in ("TIME", "INTERVAL", "FIELD_ID"))
     for column, values, right, words in (
-        ("TIME", time, (time >= 0) & (time < _LATEST_S) & ((time > 0) | ~time.any()), "a time in MJD seconds"),  # 0: not filled
+        # 0: not filled
+        ("TIME", time, (time >= 0) & (time < _LATEST_S) & ((time > 0) | ~time.any()), "a time in MJD seconds"),
         ("INTERVAL", interval, np.abs(interval) < _LATEST_S, "a number of seconds"),
         ("FIELD_ID", field, (field >= 0) & (field < fields), f"a row of FIELD, 0 to {fields - 1}"),
     ):

@@ -72,7 +72,7 @@ def check_model_column_writable(selection):
 
 
 def _check_cells(ms):
-    """Raise where a model column has no cell, or one of another shape, in a selected row: it is left to the user to remove."""
+    """Raise where a model column has no cell, or one of another shape, in a selected row: the user may remove it."""
     with opened("table", ms.name) as tb:
         if _COLUMN not in tb.colnames():
             return
@@ -82,8 +82,9 @@ def _check_cells(ms):
             if lacking:
                 raise ValueError(f"vis = '{ms.name}': {_COLUMN} of row {min(lacking)} is empty")
         except ValueError as error:
-            raise ValueError(f"savemodel = 'modelcolumn': {error}; casatasks.delmod(vis={ms.name!r}, otf=False, scr=True) "
-                             f"removes {_COLUMN}, and tsara then writes a new one; or set savemodel = 'none'") from error
+            raise ValueError(f"savemodel = 'modelcolumn': {error}; casatasks.delmod(vis={ms.name!r}, otf=False, "
+                             f"scr=True) removes {_COLUMN}, and tsara then writes a new one; or set "
+                                 "savemodel = 'none'") from error
 
 
 def _check_space(name, count):

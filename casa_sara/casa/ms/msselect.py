@@ -35,7 +35,8 @@ def for_parser(name, strings):
         return strings
     names, words = texts(name, "FIELD", "NAME"), []
     for word in strings["field"].split(","):
-        words += [str(number) for number, one in enumerate(names) if one == word.strip() and not one.isascii()] or [word]
+        words += [str(number) for number, one in enumerate(names)
+                  if one == word.strip() and not one.isascii()] or [word]
     return strings | {"field": ",".join(words)}
 
 

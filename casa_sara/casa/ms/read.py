@@ -30,27 +30,29 @@ _ROW_COLUMNS = {
     "antenna1": "ANTENNA1",
     "antenna2": "ANTENNA2",
 }
-_SAMPLE_DTYPES = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64, "row": np.int32,
+_SAMPLE_DTYPES = {"vis": np.complex64, "weight": np.float32, "imaging_weight": np.float32, "uvw": np.float64,
+                  "row": np.int32,
                   "chan": np.int16, "freq_hz": np.float32}
-_ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64, "hands": np.int8}
+_ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw": np.int16, "row": np.int64,
+               "hands": np.int8}
 
 
 def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, ranks=ALONE):
     """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
 
-    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel-hand correlation there is, and as tclean (of circular, or
-    of linear feeds)
+    V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel-hand correlation there is, and as tclean (of
+    circular, or of linear feeds)
 
         V_Q = (V_RL + V_LR)/2,  (V_XX − V_YY)/2;    V_U = (V_RL − V_LR)/2i,  (V_XY + V_YX)/2;
         V_V = (V_RR − V_LL)/2,  (V_XY − V_YX)/2i;
 
     where the Stokes parameter itself is stored, it is used as it is.
 
-    A sample is left out when any of its correlations is flagged (cross-hands too, as in tclean), when its row is flagged or
-    an autocorrelation, and when data, weights or uvw cannot be used; what was left out is counted by the first reason that
-    applies. Weights are, row by row, WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the data column (as in tclean).
-    Where one parallel-hand correlation has no weight (0, negative or NaN), Stokes I is the other one, with its weight;
-    tclean takes the mean of both there.
+    A sample is left out when any of its correlations is flagged (cross-hands too, as in tclean), when its row is
+    flagged or an autocorrelation, and when data, weights or uvw cannot be used; what was left out is counted by the
+    first reason that applies. Weights are, row by row, WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the
+    data column (as in tclean). Where one parallel-hand correlation has no weight (0, negative or NaN), Stokes I is the
+    other one, with its weight; tclean takes the mean of both there.
 
     The inverse variance of Re V_I and of Im V_I follows from those of the correlations:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
@@ -70,8 +72,8 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     frequencies : bool
         Keep the frequency of each sample.
     ranks : casa_sara.parallel.partition.RankAssignment
-        The ranks that read, each its rows: what is returned is this rank's, but the counts, notes and frequencies are of
-        all.
+        The ranks that read, each its rows: what is returned is this rank's, but the counts, notes and frequencies are
+        of all.
 
     Returns
     -------
@@ -149,9 +151,10 @@ def _pieces(group):
 
 @dataclass
 class _Chunk:
-    """R rows and C channels: `vis` and `weight` hold one (R, C) array for each correlation, `weighing` tclean's two weights.
+    """R rows, C channels: `vis` and `weight` hold an (R, C) array per correlation, `weighing` tclean's two weights.
 
-    `either` is that of the RowGroup; `undefined` says of which rows (bool (R,)) a cell of DATA, FLAG or WEIGHT is not there.
+    `either` is that of the RowGroup; `undefined` says of which rows (bool (R,)) a cell of DATA, FLAG or WEIGHT is not
+    there.
     """
 
     rows: np.ndarray
@@ -216,7 +219,8 @@ class _SampleTable:
         self.usable = Usability()
         self._size = self._rows_so_far = 0
         self._alone = []
-        self._samples = {name: [np.empty((3, 0) if name == "uvw" else 0, dtype)] for name, dtype in _SAMPLE_DTYPES.items()
+        self._samples = {name: [np.empty((3, 0) if name == "uvw" else 0, dtype)]
+                         for name, dtype in _SAMPLE_DTYPES.items()
                          if frequencies or name != "freq_hz"}
         self._rows = {name: [np.empty(0, _ROW_DTYPES.get(name, np.int32))] for name in RowTable.__dataclass_fields__}
 
@@ -265,7 +269,7 @@ class _SampleTable:
 
 
 def _formed(chunk, group, ok, weighted):
-    """Return the Stokes parameter of the samples that are `ok` and its inverse variance, and where it is one correlation alone.
+    """Return the Stokes parameter of the samples that are `ok`, its inverse variance, and where it is one correlation.
 
     Returns
     -------
@@ -285,7 +289,7 @@ def _formed(chunk, group, ok, weighted):
 
 
 def _imaging_weight(weighing, alone, otherwise):
-    """Return the mean of tclean's two weights, or `otherwise`, the weight by the noise, where one of them is not usable."""
+    """Return the mean of tclean's two weights, or `otherwise`, the weight by the noise, where one is not usable."""
     unusable = np.any([*alone, *(~(weight >= LIGHTEST) for weight in weighing)], axis=0)
     return np.where(unusable, otherwise, sum(weighing) / len(weighing))
 
@@ -301,8 +305,9 @@ def _check_directions(phasecenter, image, selected):
         for number, direction in ms.fields.items():
             apart = np.degrees(separation(on_sky(direction, ms, ms.start_s), image))
             if apart > _WIDEST_BEAM:
-                raise ValueError(f"phasecenter = '{phasecenter}': field {number} of '{ms.name}' is {apart:.3g} degrees from "
-                                 f"the centre of the image: should be within {_WIDEST_BEAM:g}; choose fields with field")
+                raise ValueError(f"phasecenter = '{phasecenter}': field {number} of '{ms.name}' is {apart:.3g} degrees "
+                                 f"from the centre of the image: should be within {_WIDEST_BEAM:g}; choose fields with "
+                                 "field")
 
 
 def _counts(dropped):

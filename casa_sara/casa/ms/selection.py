@@ -22,7 +22,8 @@ __all__ = ["UNPOLARISED", "RowGroup", "SelectedMS", "select_data"]
 
 UNPOLARISED = "it is imaged as Stokes I, as if the source were unpolarised"
 _DATA_COLUMNS = {"corrected": "CORRECTED_DATA", "data": "DATA", "observed": "DATA"}
-_STOKES_CODES = {1: "I", 2: "Q", 3: "U", 4: "V", 5: "RR", 6: "RL", 7: "LR", 8: "LL", 9: "XX", 10: "XY", 11: "YX", 12: "YY"}
+_STOKES_CODES = {1: "I", 2: "Q", 3: "U", 4: "V", 5: "RR", 6: "RL", 7: "LR", 8: "LL", 9: "XX", 10: "XY", 11: "YX",
+                 12: "YY"}
 _PARALLEL = (5, 8, 9, 12)
 _LAST_CHANNEL = 32767
 # Stokes parameter → ways to form it: two correlations a and b, s and d of (a + s·b)/d
@@ -160,8 +161,8 @@ def _check_parameters(selection):
     chosen = [(os.path.realpath(name), selection.of(number)) for number, name in enumerate(selection.vis)]
     for number, one in enumerate(chosen):
         if one in chosen[:number]:
-            raise ValueError(f"vis = {list(selection.vis)} has the same data of '{selection.vis[number]}' twice: should "
-                             "name each MeasurementSet once, or select different parts of it")
+            raise ValueError(f"vis = {list(selection.vis)} has the same data of '{selection.vis[number]}' twice: "
+                             "should name each MeasurementSet once, or select different parts of it")
 
 
 def _data_column(name, datacolumn, notes):
@@ -197,7 +198,8 @@ def _describe(number, name, column, rows, wanted, notes):
             codes = np.ravel(md.corrtypesforpol(md.polidfordatadesc(int(dd)))).tolist()
             chosen = channels.get(spw, np.arange(md.nchan(spw)))
             if chosen[-1] > _LAST_CHANNEL:
-                raise ValueError(f"spw {spw} of '{name}': channels beyond {_LAST_CHANNEL} cannot be imaged, select others")
+                raise ValueError(f"spw {spw} of '{name}': channels beyond {_LAST_CHANNEL} cannot be imaged, select "
+                                 "others")
             groups.append(
                 RowGroup(
                     spw=spw,
@@ -214,8 +216,8 @@ def _describe(number, name, column, rows, wanted, notes):
             )
         groups = _with_lacking(name, column, groups)
         if all(group.has(column, group.rows).sum() == 0 for group in groups):
-            raise ValueError(f"vis: the {column} column of '{name}' is empty at row {rows[0]} and at all others that are "
-                             "selected")
+            raise ValueError(f"vis: the {column} column of '{name}' is empty at row {rows[0]} and at all others that "
+                             "are selected")
         return SelectedMS(
             number=number,
             name=name,
@@ -229,7 +231,7 @@ def _describe(number, name, column, rows, wanted, notes):
 
 
 def _with_lacking(name, column, groups):
-    """Return the groups with the rows that lack cells; raise where a cell does not fit spectral window and correlations."""
+    """Return the groups with the rows that lack cells; raise where a cell does not fit its window and correlations."""
     wanted = {}
     for group in groups:
         matrix, vector = group.cell_shape, group.cell_shape[:1]
@@ -249,7 +251,7 @@ def _position(md, observation):
 
 
 def _formation(name, spw, codes, stokes, notes):
-    """Return how a Stokes parameter is formed of the correlations `codes`: the fields `hands` to `weighing` of a RowGroup."""
+    """Return how a Stokes parameter is formed of correlations `codes`: fields `hands` to `weighing` of a RowGroup."""
     weighing = tuple(sorted({0, len(codes) - 1}))
     alone = dict(hands=(), divisor=1, weighing=weighing)
     for number, code in enumerate(codes):  # the Stokes parameter itself
@@ -257,7 +259,8 @@ def _formation(name, spw, codes, stokes, notes):
             return alone | dict(hands=(number,))
     for first, second, sign, divisor in _FORMED.get(stokes, ()):
         if {first, second} <= set(codes):
-            return dict(hands=(codes.index(first), codes.index(second)), sign=sign, divisor=divisor, either=stokes == "I",
+            return dict(hands=(codes.index(first), codes.index(second)), sign=sign, divisor=divisor,
+                        either=stokes == "I",
                         weighing=weighing)
     parallel = [number for number, code in enumerate(codes) if code in _PARALLEL]
     if stokes == "I" and parallel:

@@ -1,10 +1,10 @@
 """The subtables of a MeasurementSet: a check of their cells, and corrected copies for CASA.
 
-A single number that is not finite, an empty cell or a character that is not UTF-8, even in a row that no data refer to, makes
-CASA refuse the whole MeasurementSet, hang, or end the process. The table tool can read all of them, so the subtables are
-checked here first. Where a cell is wrong, CASA's other tools are given a folder with links to the files of the
-MeasurementSet and corrected copies of the subtables in question. A wrong cell on which the image depends is an error
-when selected data refer to it. The MeasurementSet itself is not changed.
+A single number that is not finite, an empty cell or a character that is not UTF-8, even in a row that no data refer to,
+makes CASA refuse the whole MeasurementSet, hang, or end the process. The table tool can read all of them, so the
+subtables are checked here first. Where a cell is wrong, CASA's other tools are given a folder with links to the files
+of the MeasurementSet and corrected copies of the subtables in question. A wrong cell on which the image depends is an
+error when selected data refer to it. The MeasurementSet itself is not changed.
 """
 
 from __future__ import annotations
@@ -43,7 +43,8 @@ _COLUMNS = {  # that CASA wants in the subtables: type, and 'arrays' → names
     "FEED": {"int": "ANTENNA_ID BEAM_ID FEED_ID NUM_RECEPTORS SPECTRAL_WINDOW_ID", "double": "INTERVAL TIME",
              "double arrays": "BEAM_OFFSET POSITION RECEPTOR_ANGLE", "complex arrays": "POL_RESPONSE",
              "string arrays": "POLARIZATION_TYPE"},
-    "FLAG_CMD": {"string": "COMMAND REASON TYPE", "int": "LEVEL SEVERITY", "double": "INTERVAL TIME", "boolean": "APPLIED"},
+    "FLAG_CMD": {"string": "COMMAND REASON TYPE", "int": "LEVEL SEVERITY", "double": "INTERVAL TIME",
+                 "boolean": "APPLIED"},
     "HISTORY": {"string": "APPLICATION MESSAGE ORIGIN PRIORITY", "string arrays": "APP_PARAMS CLI_COMMAND",
                 "int": "OBJECT_ID OBSERVATION_ID", "double": "TIME"},
     "POINTING": {"string": "NAME", "int": "ANTENNA_ID NUM_POLY", "double": "INTERVAL TIME TIME_ORIGIN",
@@ -60,11 +61,11 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
 class _Rule(NamedTuple):
-    """What a cell should hold: `right` takes the cell, the others of its row by name and the numbers of rows by subtable.
+    """What a cell should hold: `right` takes the cell, others of its row by name, and numbers of rows by subtable.
 
     `instead` takes the others of its row and returns what stands for a wrong cell, which the image does not depend on.
-    Without it a wrong cell is refused when selected data refer to it, and elsewhere the cell of a row that is right stands
-    for it.
+    Without it a wrong cell is refused when selected data refer to it, and elsewhere the cell of a row that is right
+    stands for it.
     """
 
     column: str
@@ -125,12 +126,14 @@ _RULES = {
     "SPECTRAL_WINDOW": (
         _Rule("CHAN_FREQ", "a frequency in Hz for each channel",
               lambda cell, row, counts: cell.ndim == 1 and cell.size and np.isfinite(cell) & (cell > 0)),
-        _Rule("CHAN_WIDTH", "a width in Hz for each channel", _per_channel(lambda cell: np.isfinite(cell) & (cell != 0))),
+        _Rule("CHAN_WIDTH", "a width in Hz for each channel",
+              _per_channel(lambda cell: np.isfinite(cell) & (cell != 0))),
         _Rule("NUM_CHAN", "the number of channels in CHAN_FREQ", _size_of("CHAN_FREQ")),
         _Rule("MEAS_FREQ_REF", "the code of a frame", lambda cell, row, counts: int(cell) in _FREQUENCY_FRAMES),
         _Rule("EFFECTIVE_BW", "", _per_channel(np.isfinite), lambda row: np.abs(row["CHAN_WIDTH"])),
         _Rule("RESOLUTION", "", _per_channel(np.isfinite), lambda row: np.abs(row["CHAN_WIDTH"])),
-        _Rule("REF_FREQUENCY", "", lambda cell, row, counts: np.isfinite(cell) & (cell > 0), lambda row: row["CHAN_FREQ"][0]),
+        _Rule("REF_FREQUENCY", "", lambda cell, row, counts: np.isfinite(cell) & (cell > 0),
+              lambda row: row["CHAN_FREQ"][0]),
         _Rule("TOTAL_BANDWIDTH", "", _numbers(), lambda row: np.abs(row["CHAN_WIDTH"]).sum()),
     ),
     "SOURCE": (
@@ -179,7 +182,7 @@ _known: dict[str, tuple[tuple, _Subtables]] = {}
 
 
 def readable(name, diameters=False):
-    """Return the path of a MeasurementSet that all tools of CASA can read: `name` itself, unless its subtables are wrong.
+    """Return the path of a MeasurementSet that all CASA tools can read: `name`, unless its subtables are wrong.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""The cells of a MeasurementSet's main table: which there are, and whether they have the shapes that its subtables give.
+"""The cells of a MeasurementSet's main table: which there are, and whether their shapes fit its subtables.
 
 casacore ends the process where a slice is read of a cell that is too small. So the shapes are looked at before any
-cell is read. A tiled storage manager knows the shapes that it holds, which settles most columns without a look at a row; the
-rows of other columns are sifted by TaQL: 0.05 s for a million of them, 0.5 s in a column that is not tiled.
+cell is read. A tiled storage manager knows the shapes that it holds, which settles most columns without a look at a
+row; the rows of other columns are sifted by TaQL: 0.05 s for a million of them, 0.5 s in a column that is not tiled.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def lacking_cells(tb, name, wanted):
 
 
 def first_misfit(tb, column, shape):
-    """Return what is wrong with the first cell of a column that has not this shape, or is not there; '' where all have it."""
+    """Return what is wrong with the first cell of a column that has not this shape, or is missing; '' if none."""
     doubt = _doubt(tb, column, shape, _tiled_shapes(tb))
     odd = _rows_where(tb, doubt) if doubt else np.arange(0)
     return _words(tb, column, odd.min(), shape) if odd.size else ""
@@ -96,7 +96,7 @@ def _doubt(tb, column, shape, tiles):
 
 
 def _tiled_shapes(tb):
-    """Return of each tiled column the set of the shapes of its cells, and the number of these (of one table of several)."""
+    """Return for each tiled column of one table of several the set of its cells' shapes, and their number."""
     tiles = {}
     for manager in tb.getdminfo().values():
         if "HYPERCUBES" in manager["SPEC"]:
@@ -107,7 +107,7 @@ def _tiled_shapes(tb):
 
 
 def _rows_where(tb, condition, dds=None):
-    """Return the numbers of the rows of a table, or of those of some data descriptions, that fulfil a TaQL condition."""
+    """Return the numbers of a table's rows, or those of some data descriptions, that fulfil a TaQL condition."""
     if dds is not None:
         condition = f"DATA_DESC_ID IN {dds} && ({condition})"
     with tempfile.TemporaryDirectory(prefix="casa_sara_") as folder:

@@ -19,7 +19,8 @@ SMALLEST, LARGEST = 1e-18, 1e18  # of √w·|V|: its square is a number in singl
 LIGHTEST, HEAVIEST = 1e-30, 1e30  # of the weights, in 1/Jy²
 SUREST = 1e9  # √w·|V| beyond what any receiver measures
 ABOVE_OTHERS = 1e6  # times what others have: no sky and no receiver
-FEW, MINORITY = 0.01, 0.5  # of the samples, whose weights others outvote: in any case, and where one antenna has them all
+# of the samples, whose weights others outvote: in any case, and where one antenna has them all
+FEW, MINORITY = 0.01, 0.5
 LONGEST_M = 1e9  # of baselines: between antennas on the Earth and in orbit around it
 
 
@@ -44,11 +45,12 @@ class Usability:
     def __call__(self, chunk):
         """Return which samples to keep of R rows and C channels, bool (R, C), and count the others.
 
-        Beside flags, cells that are not there and numbers that are none, these are left out: weights and data beyond single
-        precision; baselines of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
+        Beside flags, cells that are not there and numbers that are none, these are left out: weights and data beyond
+        single precision; baselines of length 0 between two antennas, which nobody filled in, and of more than 1e9 m.
 
-        A correlation has no weight where its weight is not a number, 0, negative or below 1e-30 /Jy². Where the other one is
-        enough, as for Stokes I, it has none either below 1e-6 of the other's, and what it holds there does not matter.
+        A correlation has no weight where its weight is not a number, 0, negative or below 1e-30 /Jy². Where the other
+        one is enough, as for Stokes I, it has none either below 1e-6 of the other's, and what it holds there does not
+        matter.
 
         Returns
         -------
@@ -79,12 +81,12 @@ class Usability:
         return ok, weighted
 
     def compare(self, data, comm=SERIAL):
-        """Return which samples of all can be used, bool (M,), and count the others: weights and data far above the rest.
+        """Return which samples can be used, bool (M,), and count the others: weights and data far above the rest.
 
-        Weights tell what is to be believed. They are wrong where they stand out by a gap, a factor of 1e6 without any between,
-        and where those above it are too few to be an observation: 1 % of the samples at most, or fewer than half and all
-        of one antenna, unless the whole selection has it. More than these are believed, and what lies below such a gap,
-        which hardly counts in an image, has no say in the following.
+        Weights tell what is to be believed. They are wrong where they stand out by a gap, a factor of 1e6 without any
+        between, and where those above it are too few to be an observation: 1 % of the samples at most, or fewer than
+        half and all of one antenna, unless the whole selection has it. More than these are believed, and what lies
+        below such a gap, which hardly counts in an image, has no say in the following.
 
         Data are wrong above 1e9 times their noise and 1e6 times the median of √w·|V|.
 

@@ -39,8 +39,8 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     The uv cells are square, of side 1/(field of view) of the larger image side. imager reads
     the selection again, without autocorrelations and flagged rows; the MeasurementSets are
     opened read-only and nothing is written to them. Where samples were left out that no flag
-    told it of, where one correlation has no weight, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM, and
-    where its grid cannot be right, because it holds less than the sample itself, the samples are counted here.
+    told it of, where one correlation has no weight, where only some rows of a MeasurementSet have a WEIGHT_SPECTRUM,
+    and where its grid cannot be right, because it holds less than the sample itself, the samples are counted here.
 
     Parameters
     ----------
@@ -67,10 +67,12 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     if selection is not None and in_flags and not visibilities.alone and not visibilities.mixed_weights:
         for number in np.unique(np.concatenate(comm.allgather(np.unique(visibilities.rows.ms)))):
             try:
-                density += comm.once(_imager_grid, visibilities.ms_names[number], selection.of(number), side, cell)[cells]
+                density += comm.once(_imager_grid, visibilities.ms_names[number], selection.of(number), side,
+                                     cell)[cells]
             except RuntimeError as error:
-                raise ValueError(f"vis = '{visibilities.ms_names[number]}': CASA finds no density of the samples, on {side} x "
-                                 f"{side} cells for imsize = {list(grid.shape)}: {' '.join(str(error).split())}") from error
+                raise ValueError(f"vis = '{visibilities.ms_names[number]}': CASA finds no density of the samples, on "
+                                 f"{side} x {side} cells for imsize = {list(grid.shape)}: "
+                                 f"{' '.join(str(error).split())}") from error
     weight = visibilities.imaging_weight
     bad = ~((density >= 0.5 * weight) & np.isfinite(density))
     if comm.total(np.count_nonzero(bad)):
@@ -116,7 +118,8 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
         shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
         to_cell = np.rint if grid.is_cube else np.trunc
         cells = _cells(-u, v, shape, grid.cell_rad, to_cell)
-        counts = comm.allreduce(_count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights, shape[0] * shape[1]))
+        counts = comm.allreduce(_count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights,
+                                       shape[0] * shape[1]))
         if not counts.any():
             raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
         density = counts[cells]
@@ -130,7 +133,7 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
 
 
 def sum_of_weights(visibilities, weights, stokes="I"):
-    """tclean's `.sumwt`: each sample of Stokes I counts once for each parallel-hand correlation that it is the mean of."""
+    """tclean's `.sumwt`: each sample of Stokes I counts once for each parallel-hand correlation in its mean."""
     if stokes != "I":
         return float(weights.sum(dtype=float))
     return float(np.dot(weights, visibilities.rows.hands[visibilities.row].astype(float)))
@@ -165,7 +168,8 @@ def _imager_grid(name, strings, side, cell):
 
     im = casatools.imager()
     try:
-        chosen = {_SELECTVIS_KEYS.get(parameter, parameter): value for parameter, value in for_parser(name, strings).items()}
+        chosen = {_SELECTVIS_KEYS.get(parameter, parameter): value
+                  for parameter, value in for_parser(name, strings).items()}
         im.selectvis(vis=readable(name), writeaccess=False, taql="ANTENNA1 != ANTENNA2 && !FLAG_ROW", **chosen)
         im.defineimage(nx=side, ny=side, cellx=f"{cell!r}rad", celly=f"{cell!r}rad", mode="mfs", stokes="I")
         im.weight(type="uniform", npixels=side)

@@ -25,7 +25,8 @@ __all__ = ["ChildError", "in_child", "waiting_child"]
 
 # sys.path comes along; the folder that Python puts first is the user's, whose files may have the names of modules
 _MPI = ("OMPI_", "PMIX_", "PMI_")  # variables by which a process knows that it is a rank
-_START = "import sys; sys.path[:] = sys.argv[1:]; del sys.argv[1:]; from casa_sara.casa.runtime.child_process import main; main()"
+_START = ("import sys; sys.path[:] = sys.argv[1:]; del sys.argv[1:]; "
+          "from casa_sara.casa.runtime.child_process import main; main()")
 
 
 class ChildError(RuntimeError):

@@ -88,8 +88,8 @@ def _lock(handle, imagename):
     except OSError as error:
         if error.errno not in _WITHOUT_LOCKS:
             raise
-        log.warn(f"imagename = '{imagename}': the file system does not support locks ({error.strerror}): do not start another "
-                 "run under this name at the same time")
+        log.warn(f"imagename = '{imagename}': the file system does not support locks ({error.strerror}): do not start "
+                 "another run under this name at the same time")
 
 
 def _said(handle):

@@ -60,7 +60,8 @@ def logged_task(name: str, arguments: dict[str, Any]) -> Iterator[Callable[[Any]
     try:
         yield result.append
     except Exception as error:
-        post(f"Task {name} raised an exception of class {type(error).__name__} with the following message: {error}", "ERROR")
+        post(f"Task {name} raised an exception of class {type(error).__name__} with the following message: {error}",
+             "ERROR")
         raise
     finally:
         post(f"Result {name}: {result[0] if result else None!r}", "DEBUG")

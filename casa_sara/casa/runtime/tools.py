@@ -41,7 +41,8 @@ def made(path, parameter):
     ValueError
     """
     if not os.path.exists(path):
-        raise ValueError(f"{parameter}: CASA cannot make the {os.path.splitext(path)[1]} image; the reason is in the CASA log")
+        raise ValueError(f"{parameter}: CASA cannot make the {os.path.splitext(path)[1]} image; the reason is in the "
+                         "CASA log")
     return path
 
 
@@ -78,7 +79,7 @@ def more_handles(names):
 
 
 def check_handles(name, names):
-    """Raise unless the process may open the files of one more of several MeasurementSets: CASA ends it where it may not.
+    """Raise unless the process may open the files of one more MeasurementSet: CASA ends it where it may not.
 
     Raises
     ------
@@ -119,6 +120,6 @@ def scratch_folder(shape):
         needed, free = 10 * math.prod(shape) + 2_000_000, shutil.disk_usage(folder).free
         if free < needed:
             raise OSError(errno.ENOSPC, f"the folder of temporary files, '{tempfile.gettempdir()}', has "
-                          f"{free / 1e6:.1f} MB left, and an image takes {needed / 1e6:.1f} MB: free some, or set TMPDIR to "
-                          "another folder")
+                          f"{free / 1e6:.1f} MB left, and an image takes {needed / 1e6:.1f} MB: free some, or set "
+                          "TMPDIR to another folder")
         yield folder
