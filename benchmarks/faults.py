@@ -21,7 +21,7 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests" / folder) for folder in ("", "faults")]
 
-from spoiled import BROKEN, CORRELATION, FAULTS, GRID, HOPELESS, observe, put  # noqa: E402
+from spoiled import BROKEN, CORRELATION, FAULTS, GRID, HOPELESS, observe, put
 
 LONGEST_S = 60
 SPOILING = {name: spoil for name, (spoil, _) in FAULTS.items()} | HOPELESS | BROKEN

@@ -30,23 +30,24 @@ import casatools
 parts["import casatools"] = time.perf_counter() - mark
 mark = time.perf_counter()
 import casa_sara.private.task_tsara
-from casa_sara.imaging import continuum
+from casa_sara.imaging import continuum, plane_images
 parts["import the other modules"] = time.perf_counter() - mark
 
-def timed(name, label):
-    function = getattr(continuum, name)
+def timed(name, label, module=continuum):
+    function = getattr(module, name)
     def replacement(*arguments, **options):
         begin = time.perf_counter()
         try:
             return function(*arguments, **options)
         finally:
             parts[label] = parts.get(label, 0.0) + time.perf_counter() - begin
-    setattr(continuum, name, replacement)
+    setattr(module, name, replacement)
 
 for name, label in (("forecast_run", "look at the data, forecast"), ("_read", "read, primary beam"),
-                    ("_point_spread", "weights, PSF, beam; twice"), ("solve_image", "solve"),
+                    ("point_spread", "weights, PSF, beam; twice"), ("solve_image", "solve"),
                     ("write_products", "write")):
     timed(name, label)
+timed("point_spread", "weights, PSF, beam; twice", plane_images)
 tsara(vis=sys.argv[1], imagename="image", datacolumn="data", imsize=64, cell="0.2arcsec", overwrite=True)
 parts["all"] = time.perf_counter() - start
 print(json.dumps(parts))

@@ -33,9 +33,9 @@ import numpy as np
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / "tests" / folder) for folder in ("", "faults")]
 
-from machinery import hashes  # noqa: E402
-from simulated_ms import add_column, column, edit, pixels  # noqa: E402
-from spoiled import GRID, ROW, cells, lacking, observe, put, remake, shaped, undefined  # noqa: E402
+from machinery import hashes
+from simulated_ms import column, edit, pixels
+from spoiled import GRID, ROW, cells, lacking, observe, put, remake, shaped, undefined
 
 LONGEST_S = 60  # of one case
 SAME = 1e-5  # of the peak

@@ -166,6 +166,18 @@ class Limits:
 
 
 @dataclass(frozen=True)
+class ImagingRequest:
+    """What a run of tsara is asked for."""
+
+    selection: Selection
+    grid: ImageGrid
+    weighting: Weighting
+    options: SolverOptions
+    output: Output
+    limits: Limits = Limits()
+
+
+@dataclass(frozen=True)
 class Comparing:
     """What to compare, named after the task parameters of saracompare, which describe them."""
 

@@ -7,12 +7,12 @@ from simulated_ms import CYGNUS_A, column, edit, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.ms.block_selection import divide, parsed  # noqa: E402
-from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
-from casa_sara.data.visibilities import BlockInfo  # noqa: E402
-from casa_sara.imaging.data_quality import suspects  # noqa: E402
-from casa_sara.options import Selection  # noqa: E402
+from casa_sara import tsara
+from casa_sara.casa.ms.block_selection import divide, parsed
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.data.visibilities import BlockInfo
+from casa_sara.imaging.data_quality import suspects
+from casa_sara.options import Selection
 
 CELL_RAD = np.radians(1.0 / 3600)
 NOISE, WORSE = 0.05, 10.0

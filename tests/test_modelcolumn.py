@@ -9,12 +9,12 @@ import pytest
 
 pytest.importorskip("casatools")
 
-from simulated_ms import CYGNUS_A, _tool, add_column, column, direction_cosines, edit, simulate  # noqa: E402
+from simulated_ms import CYGNUS_A, _tool, add_column, column, direction_cosines, edit, simulate
 
-from casa_sara.casa.ms import model_column  # noqa: E402
-from casa_sara.casa.ms.model_column import check_model_column_writable, save_model_column, write_model_column  # noqa: E402
-from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
-from casa_sara.options import Selection  # noqa: E402
+from casa_sara.casa.ms import model_column
+from casa_sara.casa.ms.model_column import check_model_column_writable, save_model_column, write_model_column
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.options import Selection
 
 SKY = ((1.0, 0.0, 0.0), (0.5, 2e-4, -3e-4))
 CENTRE = "J2000 19h59m33s +40d43m02s"

@@ -11,7 +11,7 @@ import pytest
 
 pytest.importorskip("casatools")
 
-from simulated_ms import (  # noqa: E402
+from simulated_ms import (
     CYGNUS_A,
     SPEED_OF_LIGHT,
     add_column,
@@ -22,9 +22,9 @@ from simulated_ms import (  # noqa: E402
     simulate,
 )
 
-from casa_sara.casa.ms.frames import rotation_between  # noqa: E402
-from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
-from casa_sara.options import Selection  # noqa: E402
+from casa_sara.casa.ms.frames import rotation_between
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.options import Selection
 
 SHARED = Path(__file__).resolve().parents[2] / "shared/data"
 NORTH = "J2000 19h59m28.5s +40d45m02s"

@@ -6,10 +6,10 @@ from simulated_ms import SPEED_OF_LIGHT, column, edit, pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.images.sky_image import read_sky_image  # noqa: E402
-from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
-from casa_sara.options import Selection  # noqa: E402
+from casa_sara import tsara
+from casa_sara.casa.images.sky_image import read_sky_image
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.options import Selection
 
 CELL_RAD = np.radians(1.0 / 3600)
 GRID = dict(imsize=[80, 72], cell="1arcsec", datacolumn="data", nthreads=1)

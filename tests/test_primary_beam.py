@@ -9,7 +9,7 @@ from simulated_ms import CYGNUS_A, edit, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import tsara  # noqa: E402
+from casa_sara import tsara
 
 ARCSEC = np.pi / 180 / 3600
 SPEED_OF_LIGHT = 299792458.0

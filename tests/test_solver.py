@@ -11,7 +11,7 @@ from casa_sara.operators._workers import Workers
 from casa_sara.solver import _kernels as kernels
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
-from casa_sara.solver.nnls import nnls
+from casa_sara.solver.nnls import NNLSFit, nnls
 from casa_sara.solver.record import CONVERGED, DIVERGED, ITERATION_LIMIT, STOPPED_BY_USER, UNFEASIBLE
 from casa_sara.solver.reweighting import Schedule, _is_settled, run_algorithm_2
 
@@ -207,7 +207,8 @@ def test_nnls_reaches_scipys_solution(last_penalty):
     gradient = stacked.T @ np.concatenate([(root * problem.vis).real, (root * problem.vis).imag])
     penalty = 0.5 * last_penalty * np.abs(gradient).max()
     expected, _ = scipy_nnls(factor, np.linalg.solve(factor.T, gradient - penalty))
-    found, residual = nnls(problem.measurement, problem.vis, problem.precond, norm_sq, 20_000, last_penalty)
+    found, residual = nnls(problem.measurement, problem.vis, problem.precond, norm_sq,
+                           NNLSFit(20_000, last_penalty))
     np.testing.assert_allclose(found.ravel(), expected, atol=1e-8)
     np.testing.assert_allclose(residual, problem.vis - problem.measurement.forward(found))
 

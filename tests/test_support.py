@@ -7,12 +7,12 @@ from simulated_ms import pixels, simulate
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import tsara  # noqa: E402
-from casa_sara.imaging.data_quality import beyond_baselines, check_confined, left_outside  # noqa: E402
-from casa_sara.solver.adaptive_ppd import AdaptivePPD  # noqa: E402
-from casa_sara.solver.l2_bounds import GivenBounds  # noqa: E402
-from casa_sara.solver.nnls import nnls  # noqa: E402
-from casa_sara.solver.positivity import Release  # noqa: E402
+from casa_sara import tsara
+from casa_sara.imaging.data_quality import beyond_baselines, check_confined, left_outside
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l2_bounds import GivenBounds
+from casa_sara.solver.nnls import NNLSFit, nnls
+from casa_sara.solver.positivity import Release
 
 CELL_RAD = np.radians(1.0 / 3600)
 GRID = dict(imsize=[80, 72], cell="1arcsec", datacolumn="data", wavelets=["dirac", "db1", "db2"], nthreads=1)
@@ -132,8 +132,8 @@ def test_confined_solution_is_that_of_the_smaller_problem(positivity):
     stacked, data = np.vstack([weighted.real, weighted.imag]), np.concatenate([vis.real, vis.imag])
     expected = lsq_linear(stacked, data, bounds=(0 if positivity else -np.inf, np.inf), tol=1e-12).x
     norm_sq = problem.data_norm_sq(problem.precond)
-    model, _ = nnls(problem.measurement, problem.vis, problem.precond, norm_sq, max_iter=3000, last_penalty=0,
-                    positivity=positivity, support=SUPPORT)
+    model, _ = nnls(problem.measurement, problem.vis, problem.precond, norm_sq,
+                    NNLSFit(3000, 0.0, positivity=positivity), support=SUPPORT)
     assert not model[~SUPPORT].any()
     np.testing.assert_allclose(model[SUPPORT], expected, atol=1e-4)
 

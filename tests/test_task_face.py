@@ -15,8 +15,8 @@ import pytest
 
 from casa_sara import tsara
 from casa_sara.options import SolverOptions
-from casa_sara.private.validation import Parameter, validate
 from casa_sara.private.parameters import TSARA
+from casa_sara.private.validation import Parameter, validate
 
 BY_NAME = {parameter.name: parameter for parameter in TSARA}
 GOOD = {"vis": "data.ms", "imagename": "try", "cell": "0.1arcsec"}

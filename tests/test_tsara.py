@@ -192,7 +192,7 @@ def test_a_failed_run_leaves_the_old_products(run, vis, tmp_path, monkeypatch):
     for product in PRODUCTS:
         shutil.copytree(f"{run[1]}.{product}", f"{name}.{product}")
     before = _hashes(tmp_path)
-    monkeypatch.setattr("casa_sara.imaging.continuum.sum_of_weights", lambda *args: "not a number")
+    monkeypatch.setattr("casa_sara.imaging.plane_images.sum_of_weights", lambda *args: "not a number")
     with pytest.raises(ValueError, match="not a number"):
         tsara(vis=vis, imagename=name, overwrite=True, niter=0, **GRID)
     assert _hashes(tmp_path) == before

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("casatasks")
 
-from casa_sara.runtime.machine import resident_memory  # noqa: E402
+from casa_sara.runtime.machine import resident_memory
 
 TUTORIALS = Path(__file__).resolve().parents[1] / "docs" / "tutorials"
 

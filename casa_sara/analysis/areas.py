@@ -122,16 +122,10 @@ def _parse(body, text, parameter):
             body = file.read()
     elif "[[" not in body and "(" not in body:
         return [_circle(body, wrong)]
-    style = "crtf" if body.startswith("#CRTF") or "[[" in body else "ds9"
-    if style == "crtf":
-        lines = [line for line in body.splitlines() if not line.startswith("#")]
-        if "coord" not in body and "pix" not in body:  # of the image, says CASA; the parser takes it for pixels
-            lines.insert(0, "global coord=J2000")
-        body = "\n".join(["#CRTFv0", *lines])
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # a line that is not understood must not be left out
-            found = list(Regions.parse(body, format=style))
+            found = list(_regions(body))
     except Exception as error:  # of many kinds, from the parsers
         raise ValueError(f"{wrong} ({error})") from None
     if not found:
@@ -143,6 +137,16 @@ def _parse(body, text, parameter):
         if not region.meta.get("include", True):
             raise ValueError(f"{parameter} = '{text}' excludes a part of the sky: should hold regions to measure in")
     return found
+
+
+def _regions(body):
+    """Return the regions of a text in CASA's or DS9's format."""
+    if not body.startswith("#CRTF") and "[[" not in body:
+        return Regions.parse(body, format="ds9")
+    lines = [line for line in body.splitlines() if not line.startswith("#")]
+    if "coord" not in body and "pix" not in body:  # of the image, says CASA; the parser takes it for pixels
+        lines.insert(0, "global coord=J2000")
+    return Regions.parse("\n".join(["#CRTFv0", *lines]), format="crtf")
 
 
 def _circle(body, wrong):

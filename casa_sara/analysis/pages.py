@@ -153,9 +153,8 @@ def _columns(comparison, weighting) -> list[str]:
     columns = ["model"]
     if weighting in comparison.beams:
         columns.append("smoothed model")
-        for kind in ("restored", "residual"):
-            if any(weighting in getattr(product, kind) for product in comparison.products):
-                columns.append(kind)
+        columns += [kind for kind in ("restored", "residual")
+                    if any(weighting in getattr(product, kind) for product in comparison.products)]
     return columns
 
 

@@ -99,7 +99,7 @@ def compare(path, columns: Sequence[Column], cell_arcsec: float, zooms: Sequence
         left = LEFT + number * (WIDTH + GAP)
         for top, kind in zip(tops, ("model", "restored", "residual")):
             panel = axes(left, top, WIDTH, height)
-            drawn = _panel(panel, column, kind, cell_arcsec, noise if kind == "residual" else brightness)
+            _panel(panel, column, kind, cell_arcsec, noise if kind == "residual" else brightness)
             _label_axes(panel, first=number == 0, last=kind == "residual")
             if kind == "model":
                 panel.set_title(column.name, fontsize=12)

@@ -160,7 +160,7 @@ def draw(axes, image, norm: Normalize, cell, colours: str = BRIGHTNESS_MAP) -> N
 
 def draw_beam(axes, beam, cell, colour: str = "white", right: bool = False) -> None:
     """Draw a beam (arcsec, arcsec, degrees from north through east) into a lower corner of the axes."""
-    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    (x0, x1), y0 = axes.get_xlim(), axes.get_ylim()[0]
     away = 0.55 * beam[0] + 0.025 * abs(x1 - x0) * cell[0]
     x, y = (x1 - away / cell[0] if right else x0 + away / cell[0]), y0 + away / cell[1]
     turned = Affine2D().rotate_deg(beam[2]).scale(1 / cell[0], 1 / cell[1]).translate(x, y)

@@ -251,11 +251,7 @@ def _beside(sets, plane, notes):
         if one.beam is None:
             raise ValueError(f"models: '{one.residual.name}' has no beam, and there is no image or PSF with a beam: "
                              "give vis, or add the restored image")
-        image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
-        if not np.isfinite(image).all():
-            covered = 100 * np.isfinite(image).mean()
-            raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{sets[0].model.name}' and "
-                             "cannot be put on its pixels: give vis, and the residuals are made there")
+        image = _residual_on(plane, one, sets[0])
         weighting = "briggs" if one.weighting in ("briggs", "uniform") else "natural"
         if one.weighting not in ("briggs", "natural"):
             known = f"weighting '{one.weighting}'" if one.weighting else "an unknown weighting"
@@ -272,6 +268,16 @@ def _beside(sets, plane, notes):
                              "add a restored image")
         beams["natural"] = beam
     return beams, residuals
+
+
+def _residual_on(plane, one, first):
+    """Return the residual image of a product on the pixels of the plane, which is that of the first product's model."""
+    image = one.residual.brightness_on(plane) if one.residual.overlaps(plane) else np.full(plane.shape, np.nan)
+    if not np.isfinite(image).all():
+        covered = 100 * np.isfinite(image).mean()
+        raise ValueError(f"models: '{one.residual.name}' covers {covered:.3g} % of '{first.model.name}' and "
+                         "cannot be put on its pixels: give vis, and the residuals are made there")
+    return image
 
 
 class _Observed:

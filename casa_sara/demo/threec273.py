@@ -45,13 +45,11 @@ def table(products: list[Product]) -> str:
     """Return flux, peak, residual and dynamic range of each product as text."""
     head = ("image", "flux", "negative", "peak", "residual rms", "dynamic range", "iterations", "time", "CPU")
     rows = [head, ("", "Jy", "Jy", "Jy/beam", "mJy/beam", "", "", "s", "s")]
-    for product in products:
-        rows.append((
-            product.name, f"{product.model.sum():.3f}", f"{np.minimum(product.model, 0).sum():.3f}",
-            f"{product.restored.max():.3f}", f"{1e3 * product.residual.std():.2f}",
-            f"{metrics.dynamic_range(product.restored, product.residual):.0f}", str(product.iterations),
-            f"{product.wall_s:.0f}", f"{product.cpu_s:.0f}",
-        ))  # fmt: skip
+    rows += [(
+        product.name, f"{product.model.sum():.3f}", f"{np.minimum(product.model, 0).sum():.3f}",
+        f"{product.restored.max():.3f}", f"{1e3 * product.residual.std():.2f}",
+        f"{metrics.dynamic_range(product.restored, product.residual):.0f}", str(product.iterations),
+        f"{product.wall_s:.0f}", f"{product.cpu_s:.0f}") for product in products]
     return layout(rows)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,12 +12,9 @@ from casa_sara.casa.images.image_files import read_model
 from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, read_pixels
 from casa_sara.casa.images.masks import read_support
 from casa_sara.casa.images.products import write_images, write_products
-from casa_sara.casa.images.restore import fit_beam
 from casa_sara.casa.images.spectral_index import with_spectrum
 from casa_sara.casa.ms.block_selection import divide
-from casa_sara.casa.ms.model_column import save_model_column, write_model_column
 from casa_sara.casa.ms.read import read_visibilities
-from casa_sara.casa.ms.weights import dirty_image, imaging_weights, sum_of_weights
 from casa_sara.casa.runtime import log
 from casa_sara.casa.runtime.child_process import waiting_child
 from casa_sara.casa.runtime.tools import opened
@@ -26,20 +23,21 @@ from casa_sara.data.visibilities import BlockInfo, Visibilities, sort_into_block
 from casa_sara.imaging.data_quality import (
     beyond_baselines,
     check_confined,
+    image_limits,
     left_outside,
     named_suspects,
+    nowhere_visible,
     suspects,
     thermal_noise,
 )
 from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.plane_images import plane_images, point_spread
+from casa_sara.imaging.predict_model import save_model
 from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
-from casa_sara.operators.measurement import Summed, check_cell, check_field
-from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
-from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Spectrum, Weighting
-from casa_sara.parallel.partition import RankAssignment
-from casa_sara.parallel.serial import SERIAL
+from casa_sara.options import ImageGrid, ImagingRequest
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.reconstruct import Reconstruction, operator_accuracy, schedule_of
@@ -47,14 +45,11 @@ from casa_sara.runtime.deadline import Deadline
 from casa_sara.solver.record import UNFINISHED
 
 __all__ = [
-    "PlaneImages", "Result", "Split", "describe", "image_limits", "make_image", "plane_images", "split", "write_column",
+    "Result", "Split", "describe", "make_image", "split",
 ]
 
-FEWEST_PIXELS = 3.0  # of the finest fringe
-LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
 MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
 REPORT_SECONDS = 30.0
-IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
 
 
 @dataclass
@@ -93,40 +88,22 @@ class Split:
     noise: np.ndarray
 
 
-@dataclass
-class PlaneImages:
-    """The images of one plane: `pixels` are 'psf', 'residual', 'model', float32 (nx, ny); `weights` (M,) made them."""
-
-    pixels: dict[str, np.ndarray]
-    weights: np.ndarray
-    sumwt: float
-    beam: dict
-
-    @property
-    def residual_peak(self) -> float:
-        """Largest absolute pixel of the residual, Jy/beam."""
-        return float(np.abs(self.pixels["residual"]).max())
-
-    @property
-    def model_flux(self) -> float:
-        """Flux of the model, Jy."""
-        return float(self.pixels["model"].sum(dtype=float))
-
-
-def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-               output: Output, record: Callable[[Result], dict] | None = None, limits: Limits = Limits(),
-               comm=SERIAL) -> Result:
+def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None = None,
+               comm: Serial = SERIAL) -> Result:
     """Image a selection of MeasurementSets and write the products.
 
     Parameters
     ----------
-    selection, grid, weighting, options, output
+    request : casa_sara.options.ImagingRequest
         What the task was asked for.
     record : callable, optional
         Returns what is kept beside the images of the result.
-    limits : Limits
     comm : casa_sara.parallel.serial.Serial or MPI
         Ranks that share the work; rank 0 alone writes.
+
+    Returns
+    -------
+    Result
 
     Raises
     ------
@@ -135,24 +112,24 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     ValueError, FileNotFoundError, RuntimeError
         For data or parameters that no image can be made of; the message names the task parameter.
     """
-    deadline, (forecast, ranks) = Deadline(limits.maxtime_s), forecast_run(selection, grid, options, limits, comm)
-    comm.together(forecast.require, limits.maxmem_gb)
-    checkpoint = checkpoint_of(selection, grid, options, output)
+    output, deadline = request.output, Deadline(request.limits.maxtime_s)
+    forecast, ranks = forecast_run(request.selection, request.grid, request.options, request.limits, comm)
+    comm.together(forecast.require, request.limits.maxmem_gb)
+    checkpoint = checkpoint_of(request)
     if output.resume:
         comm.once(checkpoint.open)
-    request = _Request(selection, grid, weighting, options, output, limits, ranks)
     with waiting_child(write_images) if comm.rank == 0 else nullcontext() as child:  # it starts while CASA reads
         with kernels_loading(log.info):
-            data, plane = _read(request)
+            data, plane = _read(request, ranks)
         if output.images_stand:
-            return _complete(request, plane, data, forecast)
+            return _complete(request, plane, data, forecast, comm)
         part = split(data, output.blocks, comm)
         del data  # the same samples, not yet sorted
-        _check(request, plane, part)
-        watch = Watch(deadline, Pace(schedule_of(options).expected_iterations), checkpoint)
-        solution = _solve(request, plane, part, watch)
-        images = plane_images(solution.part.data, solution.model, plane.grid, weighting, options, plane.image_plane,
-                              comm)
+        _check(request, plane, part, comm)
+        watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations), checkpoint)
+        solution = _solve(request, plane, part, watch, ranks)
+        images = plane_images(solution.part.data, solution.model, plane.grid, request.weighting, request.options,
+                              plane.image_plane, comm)
         doubtful = _look_back(images, plane, solution, comm)
         result = solution.result(images, doubtful, replace(forecast, iteration_s=watch.pace.seconds), comm)
         comm.once(write_products, output, plane.image_plane, images.pixels, images.sumwt, images.beam,
@@ -160,21 +137,8 @@ def make_image(selection: Selection, grid: ImageGrid, weighting: Weighting, opti
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
-        comm.once(_save_model, selection, solution.part.data, plane.grid, options, solution.model)
+        comm.once(save_model, request.selection, solution.part.data, plane.grid, request.options, solution.model)
     return result
-
-
-@dataclass(frozen=True)
-class _Request:
-    """What the task was asked for, and the ranks that work on it."""
-
-    selection: Selection
-    grid: ImageGrid
-    weighting: Weighting
-    options: SolverOptions
-    output: Output
-    limits: Limits
-    ranks: RankAssignment
 
 
 @dataclass(frozen=True)
@@ -205,10 +169,10 @@ class _Solution:
                       images.model_flux, forecast.summary(), doubtful)
 
 
-def _read(request):
+def _read(request, ranks):
     """Return this rank's visibilities, and the plane of the image with its first model and support."""
-    grid, output, comm = request.grid, request.output, request.ranks.comm
-    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), request.ranks)
+    grid, output, comm = request.grid, request.output, ranks.comm
+    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), ranks)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
     data.notes.extend(plane.notes)
@@ -225,29 +189,28 @@ def _read(request):
     return data, _Plane(plane, grid, start, support)
 
 
-def _complete(request, plane, data, forecast):
+def _complete(request, plane, data, forecast, comm):
     """Write the model column that a finished run has not written any more; its images stand."""
-    comm, model = request.ranks.comm, plane.startmodel
-    comm.once(_save_model, request.selection, data, plane.grid, request.options, model)
+    model = plane.startmodel
+    comm.once(save_model, request.selection, data, plane.grid, request.options, model)
     peak = comm.once(_peak, request.output.imagename + ".residual")
     return Result(data, comm.total(data.size), [], np.zeros(0), None, peak, float(model.sum(dtype=float)),
                   forecast.summary())
 
 
-def _check(request, plane, part):
+def _check(request, plane, part, comm):
     """Describe in the log what was read; errors of weights and beam are raised here, before the solver."""
-    data, grid, comm = part.data, plane.grid, request.ranks.comm
+    data, grid = part.data, plane.grid
     describe(data, part.blocks, part.noise, grid.stokes, comm)
     if grid.gridder == "wproject":
         accuracy = operator_accuracy(data, part.offsets, part.noise, comm)
         log.info(WTerm.of(comm.largest(data.max_w), grid.shape, grid.cell_rad, accuracy).words)
-    _point_spread(data, grid, request.weighting, request.options, plane.image_plane, comm)
+    point_spread(data, grid, request.weighting, request.options, plane.image_plane, comm)
 
 
-def _solve(request, plane, part, watch):
+def _solve(request, plane, part, watch, ranks):
     """Find the model, within the time that writing leaves, and leave out the samples that it left out."""
-    options, grid, ranks = request.options, plane.grid, request.ranks
-    comm, data = ranks.comm, part.data
+    options, grid, comm, data = request.options, plane.grid, ranks.comm, part.data
     if options.niter == 0:
         return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
     watch.deadline.reserve = _after_iterations(comm.total(data.size), grid, request.output, request.limits,
@@ -294,57 +257,11 @@ def split(data, blocks, comm=SERIAL):
     return Split(data, infos, offsets, noise)
 
 
-def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
-    """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of.
-
-    Parameters
-    ----------
-    data : Visibilities
-    model : real (nx, ny)
-        Jy/pixel.
-    grid : ImageGrid
-    weighting : Weighting
-    options : SolverOptions
-        Whose number of threads is used.
-    plane : ImagePlane
-        For the beam.
-    comm : casa_sara.parallel.serial.Serial or MPI
-        Over whose ranks the samples are spread.
-
-    Returns
-    -------
-    PlaneImages
-    """
-    weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
-    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
-    if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too
-        sumwt = float(weights.sum(dtype=float))
-    else:
-        sumwt = sum_of_weights(data, weights, grid.stokes)
-    return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, comm.total(sumwt), beam)
-
-
 def _caution(data, notes=None):
     """Warn of these notes, which the record keeps too, or of those that are there."""
     for note in data.notes if notes is None else notes:
         log.warn(note)
     data.notes.extend(notes or [])
-
-
-def _save_model(selection, data, grid, options, model):
-    """Write the model's visibilities into the MeasurementSets: the last phase, after the images are complete."""
-    log.info("writing MODEL_DATA")
-    save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
-                      cell_rad=grid.cell_rad, gridder=grid.gridder, spectrum=grid.spectrum and asdict(grid.spectrum),
-                      nthreads=options.nthreads, model=model)
-
-
-def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads, model):
-    """Predict the visibilities of a model and write them: what `save_model_column` has a child process do."""
-    chosen = {name: tuple(value) if isinstance(value, list) else value for name, value in selection.items()}
-    grid = ImageGrid(model.shape, tuple(cell_rad), gridder=gridder, spectrum=spectrum and Spectrum(**spectrum))
-    write_model_column(Selection(**chosen), phase_center, lambda uvw, freq_hz: sky_operator(
-        uvw, grid, freq_hz, eps=IMAGE_EPS, nthreads=nthreads).forward(model))
 
 
 def _peak(name):
@@ -353,52 +270,10 @@ def _peak(name):
         return float(np.abs(read_pixels(ia)).max())
 
 
-def _predicted(operator, data, grid, options, model, comm):
-    """Return the visibilities of a model, by the operator of the dirty images unless there is a spectrum."""
-    if grid.spectrum is not None:
-        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm)
-    return operator.forward(model)
-
-
-def _point_spread(data, grid, weighting, options, plane, comm):
-    """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and its fitted beam."""
-    weights = imaging_weights(data, grid, weighting, comm)
-    operator = Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm), comm)
-    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
-    return weights, operator, psf, comm.once(fit_beam, psf, plane)
-
-
-def image_limits(data, grid, comm=SERIAL):
-    """Return warnings about this image plane and these baselines; raise where no image can be made of them."""
-    notes = []
-    reach = [[comm.largest(float(np.abs(axis).max(initial=0)))] for axis in data.uvw[:2]]
-    max_uv, max_w = comm.largest(data.max_uv), comm.largest(data.max_w)
-    check_cell(np.array(reach), grid.cell_rad)
-    check_field(max_uv, grid.shape, grid.cell_rad)
-    arcsec = np.degrees(grid.cell_rad[0]) * 3600
-    pixels = 1 / (max_uv * max(grid.cell_rad))
-    if pixels < FEWEST_PIXELS:
-        notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below "
-                     f"{FEWEST_PIXELS:g} sources between pixels cannot be represented; 5 would be cell = "
-                     f"'{arcsec * pixels / 5:.3g}arcsec'")
-    corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
-    phase = np.pi * max_w * corner_sq
-    if phase > LARGEST_W_PHASE and grid.gridder == "standard":
-        notes.append(f"the w-term is not modelled: it changes phases by up to {phase:.2g} rad in the corners of this "
-                     "image; gridder = 'wproject' models it")
-    return notes
-
-
 def _after_iterations(samples, grid, output, limits, read_s):
     """Seconds to reserve for the time after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
     return writing_seconds(samples, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
-
-
-def nowhere_visible(grid, output):
-    """Return the warning about an image whose pixels are masked everywhere."""
-    return (f"phasecenter = '{grid.phasecenter}': the primary beam is below pblimit = {output.pblimit:g} in the whole "
-            "image, so all of its pixels are masked")
 
 
 def describe(data, blocks, noise, stokes, comm=SERIAL):

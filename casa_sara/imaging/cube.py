@@ -15,12 +15,14 @@ from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.runtime import log
 from casa_sara.casa.runtime.child_process import waiting_child
 from casa_sara.data.visibilities import Visibilities
-from casa_sara.imaging.continuum import Result, describe, image_limits, nowhere_visible, plane_images, split
+from casa_sara.imaging.continuum import Result, describe, split
 from casa_sara.imaging.cube_checkpoint import CubeCheckpoint
+from casa_sara.imaging.data_quality import image_limits, nowhere_visible
 from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.plane_images import plane_images
 from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
-from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import ImagingRequest
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.reconstruct import check_l2bound, schedule_of
@@ -75,34 +77,22 @@ class CubeResult:
         return next((code for code in codes if code not in (CONVERGED, NOISE_ONLY)), CONVERGED)
 
 
-@dataclass
-class _Request:
-    """What the task was asked for."""
-
-    selection: Selection
-    grid: ImageGrid
-    weighting: Weighting
-    options: SolverOptions
-    output: Output
-
-
-def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, options: SolverOptions,
-              output: Output, record: Callable[[CubeResult], dict] | None = None,
-              limits: Limits = Limits()) -> CubeResult:
+def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | None = None) -> CubeResult:
     """Image a selection of MeasurementSets channel by channel, and write the products.
 
     Parameters and errors as of :func:`casa_sara.imaging.continuum.make_image`.
     """
-    deadline, (forecast, _) = Deadline(limits.maxtime_s), forecast_run(selection, grid, options, limits)
-    forecast.require(limits.maxmem_gb)
-    checkpoint = CubeCheckpoint(checkpoint_of(selection, grid, options, output))
+    grid, output, deadline = request.grid, request.output, Deadline(request.limits.maxtime_s)
+    forecast, _ = forecast_run(request.selection, grid, request.options, request.limits)
+    forecast.require(request.limits.maxmem_gb)
+    checkpoint = CubeCheckpoint(checkpoint_of(request))
     if output.resume:
         checkpoint.file.open()
     # read
     with kernels_loading(log.info):
-        data = read_visibilities(selection, grid.phasecenter, grid.stokes)
+        data = read_visibilities(request.selection, grid.phasecenter, grid.stokes)
     data.notes.extend(image_limits(data, grid))
-    cube = _Cube.of(_Request(selection, grid, weighting, options, output), data, forecast.workload.channels)
+    cube = _Cube.of(request, data, forecast.workload.channels)
     check_imagename(output.imagename, cube.plane.pb.shape, 2 * output.pbcor)
     for note in data.notes:
         log.warn(note)
@@ -111,7 +101,7 @@ def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, optio
         cube.make_dirty(k)
     # solve
     stopped = 0
-    if options.niter > 0:
+    if request.options.niter > 0:
         checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, channels=cube.order)
         deadline.reserve = cube.plane.channels * writing_seconds(0, grid.shape) + writing_seconds(data.size, (0,))
         stopped = _solve_channels(cube, checkpoint, deadline)
@@ -152,7 +142,7 @@ def _solve_channels(cube, checkpoint, deadline):
 class _Cube:
     """The images of all channels so far: `images` are 'psf', 'residual' and 'model', float32 (nchan, nx, ny)."""
 
-    request: _Request
+    request: ImagingRequest
     data: Visibilities
     plane: ImagePlane
     axis: SpectralAxis

@@ -1,18 +1,22 @@
-"""Warnings about data and results: suspect blocks, masks, scales larger than the shortest baseline sees."""
+"""Warnings about image plane, data and results: cell, w-term, suspect blocks, masks, scales that are not seen."""
 
 from __future__ import annotations
 
 import numpy as np
 from scipy.ndimage import gaussian_filter, label
 
+from casa_sara.operators.measurement import check_cell, check_field
 from casa_sara.parallel.serial import SERIAL
 
-__all__ = ["beyond_baselines", "check_confined", "left_outside", "named_suspects", "suspects", "thermal_noise"]
+__all__ = ["beyond_baselines", "check_confined", "image_limits", "left_outside", "named_suspects", "nowhere_visible",
+           "suspects", "thermal_noise"]
 
 PEAK_OUTSIDE = 6.0  # standard deviations of the thermal noise
 ABOVE_INSIDE = 1.5  # times the largest residual inside: calibration errors leave as much on either side
 FAR_ABOVE = 3.0  # times the median of the other blocks
 FAR_ABOVE_WEIGHTS = 1.5  # relative to the MS weights
+FEWEST_PIXELS = 3.0  # of the finest fringe
+LARGEST_W_PHASE = 0.3  # rad, in the corners of the image
 SEEN, LOWEST, MAIN = 0.6, 0.05, 0.2  # of the shortest baseline's fringe; of the peak; of the flux
 BINS = 5  # in the standard deviation of a Gaussian
 # of the reasons, for the log
@@ -171,3 +175,30 @@ def beyond_baselines(model, cell_rad, shortest):
                         f"fringe), but the image holds a source of {arcsec[0]:.3g} arcsec: its total flux is not "
                         "measured by these data; add data with shorter baselines"]
     return []
+
+
+def image_limits(data, grid, comm=SERIAL):
+    """Return warnings about this image plane and these baselines; raise where no image can be made of them."""
+    notes = []
+    reach = [[comm.largest(float(np.abs(axis).max(initial=0)))] for axis in data.uvw[:2]]
+    max_uv, max_w = comm.largest(data.max_uv), comm.largest(data.max_w)
+    check_cell(np.array(reach), grid.cell_rad)
+    check_field(max_uv, grid.shape, grid.cell_rad)
+    arcsec = np.degrees(grid.cell_rad[0]) * 3600
+    pixels = 1 / (max_uv * max(grid.cell_rad))
+    if pixels < FEWEST_PIXELS:
+        notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below "
+                     f"{FEWEST_PIXELS:g} sources between pixels cannot be represented; 5 would be cell = "
+                     f"'{arcsec * pixels / 5:.3g}arcsec'")
+    corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
+    phase = np.pi * max_w * corner_sq
+    if phase > LARGEST_W_PHASE and grid.gridder == "standard":
+        notes.append(f"the w-term is not modelled: it changes phases by up to {phase:.2g} rad in the corners of this "
+                     "image; gridder = 'wproject' models it")
+    return notes
+
+
+def nowhere_visible(grid, output):
+    """Return the warning about an image whose pixels are masked everywhere."""
+    return (f"phasecenter = '{grid.phasecenter}': the primary beam is below pblimit = {output.pblimit:g} in the whole "
+            "image, so all of its pixels are masked")

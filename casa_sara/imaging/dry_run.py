@@ -49,8 +49,8 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL):
         band = spectral_band(grid, volume.freq_range_hz)
 
         def memory_of(ranks, volume=volume, band=band):
-            work = Workload.of(volume, grid, options, limits.report, band, channels, share, ranks)
-            return forecast(work, resident, available, limits.maxmem_gb)
+            work = Workload.of(volume, grid, options, limits.report, band, ranks)
+            return forecast(replace(work, channels=channels, share=share), resident, available, limits.maxmem_gb)
 
         ranks = assign_ranks(comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
         found = memory_of(ranks)

@@ -62,15 +62,19 @@ class Workload:
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
 
     @classmethod
-    def of(cls, volume, grid, options, report=False, band=0.0, channels=0, share=1.0, ranks=ALONE):
-        """The workload of this rank: its share of the data that were counted (`volume`), and the task's parameters."""
+    def of(cls, volume, grid, options, report=False, band=0.0, ranks=ALONE):
+        """The workload of this rank: its share of the data that were counted (`volume`), and the task's parameters.
+
+        It is that of one plane; a cube's is made of it by `dataclasses.replace`.
+        """
         writes, bases = ranks.comm.rank == 0, len(options.wavelets)
         return cls(math.ceil(volume.samples * ranks.share), volume.reach, grid.shape, grid.cell_rad,
                    len(ranks.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
                    options.precondition, report and writes, grid.gridder, volume.max_w, bool(grid.spectralindex), band,
-                   channels, share, grid.masked, (volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
-                   options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
-                   3 if options.method == "dabbech2018" else 2)
+                   masked=grid.masked,
+                   whole=(volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
+                   confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
+                   duals=3 if options.method == "dabbech2018" else 2)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""

@@ -17,7 +17,7 @@ from casa_sara.casa.ms.weights import sampling_density
 from casa_sara.casa.runtime import log
 from casa_sara.data.visibilities import BlockInfo, Visibilities, clock
 from casa_sara.imaging.time_forecast import Pace
-from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
+from casa_sara.options import ImageGrid, ImagingRequest, Selection, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.checkpoint import Checkpoint
@@ -45,13 +45,15 @@ class Watch:
     checkpoint: Checkpoint
 
 
-def checkpoint_of(selection: Selection, grid: ImageGrid, options: SolverOptions, output: Output) -> Checkpoint:
+def checkpoint_of(request: ImagingRequest) -> Checkpoint:
     """Return the checkpoint of a run, with the task parameters on which the model depends.
 
     Where the data are is none of them (they are known by their contents), nor is how many threads there are.
     """
+    output = request.output
     startmodel = output.startmodel if output.startmodel != output.imagename + ".model" else ""  # that of restart = True
-    parameters = asdict(selection) | asdict(grid) | asdict(options) | dict(blocks=output.blocks, startmodel=startmodel)
+    parameters = asdict(request.selection) | asdict(request.grid) | asdict(request.options)
+    parameters |= dict(blocks=output.blocks, startmodel=startmodel)
     parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
     for name in ("vis", "nthreads", "spectrum"):
         del parameters[name]

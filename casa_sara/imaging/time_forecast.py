@@ -14,7 +14,7 @@ from casa_sara.operators.sky import sky_operator
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
 from casa_sara.reconstruction.reconstruct import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from casa_sara.solver.nnls import NNLS_ITERATIONS, nnls
+from casa_sara.solver.nnls import NNLS_ITERATIONS, NNLSFit, nnls
 
 __all__ = ["Pace", "Timing", "measure", "writing_seconds"]
 
@@ -91,7 +91,8 @@ def measure(data, offsets, grid, options, reading):
     image, precond = np.ones(grid.shape, np.float32), np.ones(data.size, np.float32)
     bound = float(data.weight.sum(dtype=float)) * math.prod(grid.shape)  # of the operator's squared norm
     pair = _seconds(lambda: measurement.adjoint(measurement.forward(image)))
-    first = _seconds(lambda: nnls(measurement, vis, precond, bound, max_iter=2)) / 2.5  # and one Φ of the last image
+    # and one Φ of the last image
+    first = _seconds(lambda: nnls(measurement, vis, precond, bound, NNLSFit(max_iter=2))) / 2.5
     dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
     if options.method == PAPER:
         dictionary = paper_prior(dictionary, measurement)

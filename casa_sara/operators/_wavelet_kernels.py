@@ -15,12 +15,7 @@ from numba.extending import register_jitable
 from casa_sara.operators._filter_bank import MAX_TAPS
 from casa_sara.operators._vectors import VECTOR_BYTES
 from casa_sara.operators._wavelet_lines import (
-    CLIP,
-    CLIP_WEIGHTED,
     HALO,
-    KEEP,
-    SCRATCH_ROWS,
-    TABLE_SIZE,
     Place,
     analyse_along,
     analyse_lines,

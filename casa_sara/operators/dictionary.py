@@ -18,7 +18,7 @@ import numpy.typing as npt
 import pywt
 from scipy.ndimage import maximum_filter
 
-from casa_sara.operators import _wavelet_kernels as kernels
+from casa_sara.operators import _wavelet_kernels as kernels, _wavelet_lines as lines
 from casa_sara.operators._wavelet_weights import RING_ROWS, neighbourhood_weights
 from casa_sara.operators._workers import Workers
 from casa_sara.options import SARA_BASES
@@ -110,8 +110,8 @@ class SaraDictionary:
             levels=self.levels, approx=_aligned((len(self.wavelets), approx), self.dtype),
             owner=_shares(self._filters.lengths, threads),
             window=_aligned((threads, kernels.WINDOW_ROWS, width), self.dtype),
-            scratch=_aligned((threads, kernels.SCRATCH_ROWS, width), self.dtype),
-            tables=np.zeros((threads, 2, kernels.TABLE_SIZE), np.int64))
+            scratch=_aligned((threads, lines.SCRATCH_ROWS, width), self.dtype),
+            tables=np.zeros((threads, 2, lines.TABLE_SIZE), np.int64))
 
     def allocate(self) -> np.ndarray:
         """Return a zeroed coefficient array of `coef_shape`, aligned as the kernels like it."""
@@ -152,7 +152,7 @@ class SaraDictionary:
         real coef_shape
         """
         out = self.allocate() if out is None else self._checked(out, "out", self.coef_shape)
-        self._analyse(image, self._job(out, kernels.KEEP))
+        self._analyse(image, self._job(out, lines.KEEP))
         return out
 
     def synthesis(self, coefs: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
@@ -170,7 +170,7 @@ class SaraDictionary:
         """
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         out = np.empty(self.shape, self.dtype) if out is None else self._checked(out, "out", self.shape)
-        job = self._job(coefs, kernels.KEEP)
+        job = self._job(coefs, lines.KEEP)
         self._workers.run(kernels.transform, kernels.SYNTHESISE_DEEPER, out, job)
         self._workers.run(kernels.transform, kernels.SYNTHESISE_FINEST, out, job)
         return out
@@ -212,9 +212,9 @@ class SaraDictionary:
             raise ValueError(f"threshold={threshold} must not be negative")
         self._params[:, 0], self._params[:, 1] = threshold, relaxation
         if weights is None:
-            job = self._job(dual, kernels.CLIP)
+            job = self._job(dual, lines.CLIP)
         else:
-            job = self._job(dual, kernels.CLIP_WEIGHTED, self._checked(weights, "weights", self.coef_shape))
+            job = self._job(dual, lines.CLIP_WEIGHTED, self._checked(weights, "weights", self.coef_shape))
         self._analyse(model_bar, job, back=True)
         self._workers.run(kernels.transform, kernels.SYNTHESISE_FINEST, out, job)
         return out

@@ -70,8 +70,9 @@ class MeasurementOperator:
         For an argument out of these ranges, or a `cell` too large for the longest baseline.
     """
 
-    def __init__(self, uv: np.ndarray, cell_rad: npt.ArrayLike, shape: tuple[int, int],
-                 row_scale: np.ndarray | None = None, eps: float = 1e-6, dtype: npt.DTypeLike = np.float32,
+    def __init__(self, uv: np.ndarray, cell_rad: npt.ArrayLike,  # noqa: PLR0913 - five have a default
+                 shape: tuple[int, int], row_scale: np.ndarray | None = None, eps: float = 1e-6,
+                 dtype: npt.DTypeLike = np.float32,
                  nthreads: int = 1, whole: tuple[int, npt.ArrayLike] | None = None) -> None:
         uv = np.asarray(uv, dtype=np.float64)
         if uv.ndim != 2 or uv.shape[0] != 2 or uv.shape[1] == 0 or not np.all(np.isfinite(uv)):
@@ -108,7 +109,7 @@ class MeasurementOperator:
             frequency -= axis.centre
             frequency *= axis.factor
         starts, counts = [axis.start for axis in axes], [axis.count for axis in axes]
-        self._nufft = NonUniformFFT(frequencies, scales, starts, counts, eps, self.dtype, self.workers, n_points)
+        self._nufft = NonUniformFFT(frequencies, scales, starts, counts, eps, self.workers, n_points)
         self._rows, self._columns = (
             separable(axis, size, cells, factors, self.complex_dtype)
             for axis, size, (cells, factors) in zip(axes, self.shape, self._nufft.placement))

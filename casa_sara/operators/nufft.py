@@ -55,20 +55,19 @@ class NonUniformFFT:
     frequencies : float64 (2, M)
         Cycles per sample: |f| ≤ 0.5 along rows, |g| ≤ 0.42 along columns.
     scales : real (M, 2)
-        Factors on the real and imaginary parts of the result.
+        Factors on the real and imaginary parts of the result, float32 or float64 as this is.
     starts, counts : (int, int)
         Samples are at positions starts[k] … starts[k] + counts[k] − 1 along axis k, 0 among them.
     eps : float
         Relative accuracy.
-    dtype : float32 or float64
     workers : Workers
     n_points : int, optional
         For how many points the plan is made, M unless given.
     """
 
     def __init__(self, frequencies: np.ndarray, scales: np.ndarray, starts: Sequence[int], counts: Sequence[int],
-                 eps: float, dtype: npt.DTypeLike, workers: Workers, n_points: int | None = None) -> None:
-        self._workers = workers
+                 eps: float, workers: Workers, n_points: int | None = None) -> None:
+        self._workers, dtype = workers, scales.dtype
         width, sigma, self._lengths = _least_work(n_points or frequencies.shape[1], starts, counts, eps, dtype)
         beta = kaiser_bessel.kernel_shape(width, sigma)
         self._kernel = _kernel(width, beta, dtype)

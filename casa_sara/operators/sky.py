@@ -29,8 +29,9 @@ SERIES_SAMPLE, SERIES_PIXEL = 16, 16  # rotation and one term; place, two polyno
 GRIDDER_SAMPLE, GRIDDER_PIXEL = 80, 80  # what it holds, and the grids and indices of a call
 
 
-def sky_operator(uvw: np.ndarray, grid: ImageGrid, freq_hz: np.ndarray | None = None,
-                 row_scale: np.ndarray | None = None, eps: float = 1e-6, dtype: npt.DTypeLike = np.float32,
+def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - six have a default
+                 freq_hz: np.ndarray | None = None, row_scale: np.ndarray | None = None, eps: float = 1e-6,
+                 dtype: npt.DTypeLike = np.float32,
                  nthreads: int = 1,
                  comm: Serial = SERIAL) -> MeasurementOperator | ModulatedOperator | WGridder | NoVisibilities:
     """Return the measurement operator of an image.

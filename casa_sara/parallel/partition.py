@@ -30,7 +30,7 @@ class RankAssignment:
 
     @property
     def share(self) -> float:
-        """This rank's share of the visibilities."""
+        """The share of the visibilities that is this rank's."""
         return 0.0 if self.reader(self.comm.rank) is None else 1 / self.readers
 
     def reader(self, rank):

@@ -34,7 +34,8 @@ def run_task(
 
 def _run(name, parameters, implementation, values):
     if importlib.util.find_spec("casampi"):
-        import casatasks  # makes servers of all processes of an MPI job but one, which do not come back from here
+        # makes servers of all processes of an MPI job but one, which do not come back from here
+        import casatasks  # noqa: F401 - for what its import does
     with log.logged_task(name, values) as tell_result:
         result = implementation(**validate(parameters, values))
         tell_result(result)

@@ -8,6 +8,7 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Callable
+from contextlib import suppress
 from types import ModuleType
 from typing import Any
 
@@ -78,10 +79,8 @@ class ShellTask:
         """Run the task with the arguments that are not None or, where all are, with the shell's variables."""
         given = {name: value for name, value in given.items() if value is not None}
         values = {p.name: p.default for p in self._parameters} | given if given else self._current()
-        try:
+        with suppress(OSError, ValueError):  # a convenience for tget, which must not keep the task from running
             self._save(f"{self._name}.last", values)
-        except (OSError, ValueError):
-            pass  # a convenience for tget, which must not keep the task from running
         return self._task(**values)
 
     def _current(self) -> dict[str, Any]:

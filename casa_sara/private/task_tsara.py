@@ -29,7 +29,7 @@ from casa_sara.casa.runtime.quantities import hertz, radians, seconds
 from casa_sara.imaging.continuum import make_image
 from casa_sara.imaging.cube import make_cube
 from casa_sara.imaging.dry_run import dry_run
-from casa_sara.options import Comparing, ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import Comparing, ImageGrid, ImagingRequest, Limits, Output, Selection, SolverOptions, Weighting
 from casa_sara.parallel.serial import SERIAL
 from casa_sara.private.launch import in_parallel
 from casa_sara.private.summary import cube_summary, summary
@@ -68,8 +68,8 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
-        result = make(selection, grid, weighting, options, output,
-                      lambda result: tell(result, options, full=True)["sara"], limits)
+        result = make(ImagingRequest(selection, grid, weighting, options, output, limits),
+                      lambda result: tell(result, options, full=True)["sara"])
         if parameters["report"]:
             comm.once(_report, output.imagename, selection, options.nthreads)
         elif not output.images_stand:

@@ -27,7 +27,7 @@ from casa_sara.operators._wavelet_kernels import transform
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from casa_sara.solver.nnls import nnls
+from casa_sara.solver.nnls import NNLSFit, nnls
 
 __all__ = ["compile_kernels", "kernels_loading", "use_every_kernel"]
 
@@ -92,7 +92,7 @@ def _use_operators():
         vis = measurement.forward(image)
         measurement.adjoint(vis)
     precond, norm_sq = np.ones(3, np.float32), 3.0 * image.size
-    model, _ = nnls(measurement, vis, precond, norm_sq, max_iter=1)
+    model, _ = nnls(measurement, vis, precond, norm_sq, NNLSFit(max_iter=1))
     no_prior = SimpleNamespace(allocate=lambda: np.zeros(1, np.float32), dual_step=lambda *arguments: None)
     ppd = AdaptivePPD(measurement, no_prior, vis, [0, 3], precond, norm_sq)
     ppd.start_from(model)

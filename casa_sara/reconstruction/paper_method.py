@@ -15,7 +15,7 @@ from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule
 from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.l2_bounds import chi_square_bounds
-from casa_sara.solver.nnls import nnls
+from casa_sara.solver.nnls import NNLSFit, nnls
 from casa_sara.solver.paperprior import RELAXATION, PaperPrior
 
 __all__ = ["PAPER", "block_norms", "first_threshold", "paper_bounds", "paper_iteration", "paper_prior"]
@@ -45,6 +45,7 @@ def block_norms(problem: Problem, problem_of: Callable[..., Problem], options: S
     float (d,)
     """
     schedule, samples, norms = PaperSchedule.of(options), problem.samples, []
+    fit = NNLSFit(schedule.nnls_iterations, 0.0, schedule.nnls_reltol, options.positivity)
     plain = replace(options, precondition=False)
     for start, stop in zip(samples.offsets[:-1], samples.offsets[1:]):
         if start == stop:
@@ -53,9 +54,8 @@ def block_norms(problem: Problem, problem_of: Callable[..., Problem], options: S
         chosen = np.arange(start, stop)
         alone = Samples(samples.data.take(chosen), np.array([0, stop - start]), samples.density[chosen])
         block = problem_of(alone, options=plain)
-        _, residual = nnls(block.measurement, block.vis, block.precond, block.data_norm_sq, schedule.nnls_iterations,
-                           last_penalty=0, positivity=options.positivity, stopped=stopped, support=block.support,
-                           reltol=schedule.nnls_reltol)
+        _, residual = nnls(block.measurement, block.vis, block.precond, block.data_norm_sq, fit, stopped,
+                           block.support)
         norms.append(float(np.linalg.norm(residual)))
     return np.array(norms)
 

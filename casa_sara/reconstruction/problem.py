@@ -16,7 +16,7 @@ from casa_sara.operators.sky import sky_operator
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.solver.interfaces import Measurement
-from casa_sara.solver.nnls import nnls
+from casa_sara.solver.nnls import NNLSFit, nnls
 
 __all__ = ["Findings", "Problem", "Samples", "first_image"]
 
@@ -102,8 +102,9 @@ class Problem:
     support: np.ndarray | None = None
 
     @classmethod
-    def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions, unit_jy: float, eps: float,
-           data_norm_sq: float | None = None, support: np.ndarray | None = None, comm: Serial = SERIAL) -> Problem:
+    def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - three have a default
+           unit_jy: float, eps: float, data_norm_sq: float | None = None, support: np.ndarray | None = None,
+           comm: Serial = SERIAL) -> Problem:
         """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`.
 
         Its norm is measured unless given.
@@ -169,7 +170,7 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
     problem = problem_of(samples)
     for _ in range(ROUNDS):
         first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
-                               positivity=options.positivity, stopped=stopped, support=problem.support)
+                               NNLSFit(positivity=options.positivity), stopped, problem.support)
         samples = problem.samples
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)

@@ -28,7 +28,7 @@ _DIGEST = hashlib.sha256().digest_size
 
 
 class CheckpointError(ValueError):
-    """This run cannot be continued from the checkpoint; the message says why."""
+    """The run cannot be continued from the checkpoint; the message says why."""
 
 
 def write(path: str, header: dict[str, Any], state: dict[str, Any]) -> None:

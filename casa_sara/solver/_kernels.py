@@ -32,11 +32,11 @@ def data_step(dual, phi_bar, phi_anchor, vis, precond, pieces, multipliers, rela
 
 
 @_jit
-def shifted_norms(dual, phi_bar, vis, precond, multiplier, start, stop):
+def shifted_norms(dual, phi_bar, vis, precond, multiplier):
     """Return n² = ‖q − y‖² and −½ d(n²)/dλ for q − y = U(s − y)/(U + λ), s = U⁻¹v + Φx̄."""
     norm_sq = 0.0
     slope = 0.0
-    for m in range(start, stop):
+    for m in range(vis.size):
         u = np.float64(precond[m])
         offset = dual[m] / precond[m] + phi_bar[m] - vis[m]
         power = np.float64(offset.real) ** 2 + np.float64(offset.imag) ** 2

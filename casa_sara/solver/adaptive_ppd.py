@@ -122,8 +122,9 @@ class AdaptivePPD:
         Jy/pixel in the unit of the model, for the record.
     """
 
-    def __init__(self, measurement: Measurement, dictionary: Prior, vis: np.ndarray, offsets: np.ndarray,
-                 precond: np.ndarray, data_norm_sq: float, positivity: bool = True, relaxation: float = RELAXATION,
+    def __init__(self, measurement: Measurement, dictionary: Prior,  # noqa: PLR0913 - Φ, Ψ, y, U of the paper
+                 vis: np.ndarray, offsets: np.ndarray, precond: np.ndarray, data_norm_sq: float,
+                 positivity: bool = True, relaxation: float = RELAXATION,
                  comm: Serial = SERIAL) -> None:
         self.measurement, self.comm = measurement, comm
         self.dictionary: Any = dictionary  # Algorithm 2 of either method asks for more than a step does
@@ -264,9 +265,8 @@ class AdaptivePPD:
     def _update_multipliers(self):
         """P_{E_j} of Step 5: the λ_j for which ‖q_j − y_j‖ = ε_j, from those of the iteration before."""
         for j, (start, stop) in enumerate(self.blocks()):
-            self.multipliers[j] = ellipsoid_multiplier(
-                self.l2_dual, self._phi_bar, self.vis, self.precond, self.l2_bounds[j], self.multipliers[j],
-                start, stop, comm=self.comm)
+            block = [whole[start:stop] for whole in (self.l2_dual, self._phi_bar, self.vis, self.precond)]
+            self.multipliers[j] = ellipsoid_multiplier(*block, self.l2_bounds[j], self.multipliers[j], self.comm)
 
     def _update_prior_dual(self):
         """Step 13: u from Ψ†x̄, and its gradient Ψu."""

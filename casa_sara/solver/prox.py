@@ -9,10 +9,11 @@ from casa_sara.solver import _kernels as kernels
 
 __all__ = ["ellipsoid_multiplier", "project_ellipsoid"]
 
+TOLERANCE = 1e-10  # relative change of the multiplier that ends Newton's iteration
+
 
 def ellipsoid_multiplier(dual: np.ndarray, phi_bar: np.ndarray, vis: np.ndarray, precond: np.ndarray, bound: float,
-                         multiplier: float = 0.0, start: int = 0, stop: int | None = None, tol: float = 1e-10,
-                         comm: Serial = SERIAL) -> float:
+                         multiplier: float = 0.0, comm: Serial = SERIAL) -> float:
     """Lagrange multiplier of the projection onto one data ellipsoid.
 
     The projection of s = U⁻¹v + Φx̄ in the metric U onto {q : ‖q − y‖ ≤ ε} is
@@ -25,15 +26,13 @@ def ellipsoid_multiplier(dual: np.ndarray, phi_bar: np.ndarray, vis: np.ndarray,
     Parameters
     ----------
     dual, phi_bar, vis : complex (M,)
-        v, Φx̄ and y, whitened.
+        v, Φx̄ and y of the block, whitened.
     precond : real (M,)
         U > 0.
     bound : float
         ε > 0 in whitened units.
     multiplier : float
         First guess, e.g. that of the iteration before.
-    start, stop : int
-        The block is samples start … stop − 1.
     comm : casa_sara.parallel.serial.Serial or MPI
         Whose ranks hold the samples of the block.
 
@@ -47,17 +46,16 @@ def ellipsoid_multiplier(dual: np.ndarray, phi_bar: np.ndarray, vis: np.ndarray,
     RuntimeError
         When the iteration does not settle, which only non-finite data can cause.
     """
-    stop = vis.size if stop is None else stop
-    norm_sq, _ = _norms(comm, dual, phi_bar, vis, precond, 0.0, start, stop)
+    norm_sq, _ = _norms(comm, dual, phi_bar, vis, precond, 0.0)
     if norm_sq <= bound * bound:
         return 0.0
     value = float(multiplier)
     for _ in range(100):
-        norm_sq, slope = _norms(comm, dual, phi_bar, vis, precond, value, start, stop)
+        norm_sq, slope = _norms(comm, dual, phi_bar, vis, precond, value)
         norm = np.sqrt(norm_sq)
         # Newton on 1/n − 1/ε, whose derivative is −n'/n² = slope/n³
         new = max(value + (1 / bound - 1 / norm) * norm**3 / slope, 0.0)
-        if abs(new - value) <= tol * new:
+        if abs(new - value) <= TOLERANCE * new:
             return new
         value = new
     raise RuntimeError("the projection onto a data ellipsoid did not converge: are the visibilities finite?")

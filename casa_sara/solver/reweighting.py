@@ -199,7 +199,6 @@ def _begin_last(ppd, bounds, stage):
 
 def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
     """Algorithm 1 for one set of weights; return its stop code."""
-    tolerance = schedule.final_reltol if stage.last else schedule.reltol
     record = stage.record
     while True:
         ppd.step()  # Steps 5–6 and 11–19
@@ -207,26 +206,35 @@ def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
         if bounds.adapt(ppd):  # Steps 7–10
             record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))
         progress(ppd, record)
-        if not np.isfinite(ppd.rel_change) or not np.isfinite(record.residual_norm[-1]):
-            return DIVERGED
-        if ppd.iteration >= schedule.niter:
-            return ITERATION_LIMIT
-        done = ppd.iteration - stage.start
-        if done % schedule.interval == 0:
-            _damp(ppd, record.residual_norm[-schedule.interval:])
-        if not stage.last and done >= (FIRST_INTERVALS if stage.k == 0 else 1) * schedule.interval:
-            return CONVERGED
-        # the model has settled; the residual and the bounds may need longer, but not for ever
-        stage.settled = stage.settled + 1 if ppd.rel_change < tolerance else 0
-        steady = not stage.last or _is_steady(record.residual_norm[stage.start:], schedule.interval)
-        if done > 1 and stage.settled and steady and bounds.met_by(ppd):
-            return CONVERGED
-        if stage.settled >= PATIENCE or done >= LONGEST * schedule.interval:
-            return CONVERGED if bounds.met_by(ppd) else UNFEASIBLE
+        code = _stop_code(ppd, bounds, schedule, stage)
+        if code is not None:
+            return code
         ending = stopped()
         keep(stage, ending)
         if ending:
             return STOPPED_BY_USER
+
+
+def _stop_code(ppd, bounds, schedule, stage):
+    """Return why Algorithm 1 ends after this iteration, None where it goes on; κ is adjusted after an interval."""
+    norms, done = stage.record.residual_norm, ppd.iteration - stage.start
+    if not np.isfinite(ppd.rel_change) or not np.isfinite(norms[-1]):
+        return DIVERGED
+    if ppd.iteration >= schedule.niter:
+        return ITERATION_LIMIT
+    if done % schedule.interval == 0:
+        _damp(ppd, norms[-schedule.interval:])
+    if not stage.last and done >= (FIRST_INTERVALS if stage.k == 0 else 1) * schedule.interval:
+        return CONVERGED
+    # the model has settled; the residual and the bounds may need longer, but not for ever
+    tolerance = schedule.final_reltol if stage.last else schedule.reltol
+    stage.settled = stage.settled + 1 if ppd.rel_change < tolerance else 0
+    steady = not stage.last or _is_steady(norms[stage.start:], schedule.interval)
+    if done > 1 and stage.settled and steady and bounds.met_by(ppd):
+        return CONVERGED
+    if stage.settled >= PATIENCE or done >= LONGEST * schedule.interval:
+        return CONVERGED if bounds.met_by(ppd) else UNFEASIBLE
+    return None
 
 
 def _renew_weights(ppd, bounds, schedule, stage):

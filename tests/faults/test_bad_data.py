@@ -13,11 +13,11 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import CYGNUS_A, column, edit, pixels  # noqa: E402
-from spoiled import BROKEN, FAULTS, GRID, HOPELESS, ROW, SAMPLE, flag, observe, put  # noqa: E402
+from simulated_ms import CYGNUS_A, column, edit, pixels
+from spoiled import BROKEN, FAULTS, GRID, HOPELESS, ROW, SAMPLE, flag, observe, put
 
-from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.ms.usable_samples import IN_FLAGS  # noqa: E402
+from casa_sara import tsara
+from casa_sara.casa.ms.usable_samples import IN_FLAGS
 
 SAME = 1e-5  # of the brightest pixel
 LONGEST_S = 120  # of all broken MeasurementSets together, which take some seconds
@@ -139,7 +139,7 @@ def test_one_of_them_alone(vis, copy, tmp_path, what):
     if what == "baseline":
         other, selection = (column(vis, "ANTENNA1") != 0) | (column(vis, "ANTENNA2") != 1), dict(antenna="0&1")
     else:
-        other, selection = time != time[0], dict(scan="1", timerange="<2015/06/01/%s" % _middle(time))
+        other, selection = time != time[0], dict(scan="1", timerange=f"<2015/06/01/{_middle(time)}")
     flag((..., np.flatnonzero(other)))(copy)
     assert_same(image(vis, tmp_path, **selection)[0], image(copy, tmp_path)[0])
 

@@ -8,14 +8,14 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import _tool, add_column, column, pixels  # noqa: E402
-from spoiled import GRID, ROW, cells, observe, remake, shaped, undefined  # noqa: E402
+from simulated_ms import _tool, add_column, column, pixels
+from spoiled import GRID, ROW, cells, observe, remake, shaped, undefined
 
-from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
-from casa_sara.casa.ms.selection import select_data  # noqa: E402
-from casa_sara.casa.ms.weights import sampling_density  # noqa: E402
-from casa_sara.options import ImageGrid, Selection  # noqa: E402
+from casa_sara import tsara
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.selection import select_data
+from casa_sara.casa.ms.weights import sampling_density
+from casa_sara.options import ImageGrid, Selection
 
 WINDOWS = (("8.4GHz", "2MHz", 3), ("8.6GHz", "1MHz", 5))
 INNER = (slice(32, 96), slice(32, 96))  # where tclean's gridding is good

@@ -14,11 +14,11 @@ from astropy.utils import iers
 casatools = pytest.importorskip("casatools")
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from simulated_ms import SPEED_OF_LIGHT, antenna_positions, column, edit, pixels, simulate  # noqa: E402
+from simulated_ms import SPEED_OF_LIGHT, antenna_positions, column, edit, pixels, simulate
 
-from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.casa.images import image_plane  # noqa: E402
-from casa_sara.casa.ms import frames  # noqa: E402
+from casa_sara import saracompare, tsara
+from casa_sara.casa.images import image_plane
+from casa_sara.casa.ms import frames
 
 ARCSEC = np.radians(1 / 3600)
 L, M = -5 * ARCSEC, 7 * ARCSEC  # of the 1 Jy source

@@ -8,12 +8,12 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import column, edit, pixels  # noqa: E402
-from spoiled import GRID, observe  # noqa: E402
+from simulated_ms import column, edit, pixels
+from spoiled import GRID, observe
 
-from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
-from casa_sara.options import Selection  # noqa: E402
+from casa_sara import saracompare, tsara
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.options import Selection
 
 CODES = {name: code for code, name in enumerate("I Q U V RR RL LR LL XX XY YX YY".split(), 1)}
 HELD = {  # correlations: where those stand that Stokes I is the mean of

@@ -13,11 +13,11 @@ from astropy.io import fits
 casatools = pytest.importorskip("casatools")
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from simulated_ms import pixels, simulate  # noqa: E402
+from simulated_ms import pixels, simulate
 
-from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.casa.images.sky_image import read_sky_image  # noqa: E402
-from casa_sara.casa.images.units import brightness_unit  # noqa: E402
+from casa_sara import saracompare, tsara
+from casa_sara.casa.images.sky_image import read_sky_image
+from casa_sara.casa.images.units import brightness_unit
 
 ARCSEC = np.radians(1 / 3600)
 SIDE, CELL = 64, 0.5

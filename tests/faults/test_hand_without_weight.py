@@ -8,13 +8,13 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import add_column, column, edit, pixels  # noqa: E402
-from spoiled import GRID, observe  # noqa: E402
+from simulated_ms import add_column, column, edit, pixels
+from spoiled import GRID, observe
 
-from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.ms.read import read_visibilities  # noqa: E402
-from casa_sara.casa.ms.weights import sampling_density  # noqa: E402
-from casa_sara.options import ImageGrid, Selection  # noqa: E402
+from casa_sara import tsara
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import sampling_density
+from casa_sara.options import ImageGrid, Selection
 
 ROWS, ALL, THIRD = 336, np.s_[:], np.s_[::3]
 WHERE = {"all rows": [(1, ALL)], "every third row": [(1, THIRD)], "now this, now that": [(0, THIRD), (1, np.s_[1::3])]}

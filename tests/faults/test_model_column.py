@@ -175,7 +175,7 @@ def test_a_disk_that_is_full_when_the_column_is_due(vis, uninterrupted, tmp_path
             tsara(vis=str(copy), imagename=str(tmp_path / "never"), savemodel="modelcolumn", **GRID)
         assert raised.value.errno == errno.ENOSPC and not (tmp_path / "never.model").exists()
         filler.unlink()
-        monkeypatch.setattr("casa_sara.imaging.continuum.fit_beam", fit_beam_and(lambda: fill(disk, 200_000)))
+        monkeypatch.setattr("casa_sara.imaging.plane_images.fit_beam", fit_beam_and(lambda: fill(disk, 200_000)))
         with pytest.raises(OSError, match=words):
             tsara(vis=str(copy), imagename=str(tmp_path / "source"), savemodel="modelcolumn", **GRID)
         assert (tmp_path / "source.sara.json").exists() and hashes(copy, "table.lock") == before

@@ -13,12 +13,12 @@ from astropy.io import fits
 casatools = pytest.importorskip("casatools")
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from simulated_ms import simulate  # noqa: E402
+from simulated_ms import simulate
 
-from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.casa.images.sky_image import read_sky_image  # noqa: E402
-from casa_sara.comparison.compare_images import compare_images  # noqa: E402
-from casa_sara.options import Comparing  # noqa: E402
+from casa_sara import saracompare, tsara
+from casa_sara.casa.images.sky_image import read_sky_image
+from casa_sara.comparison.compare_images import compare_images
+from casa_sara.options import Comparing
 
 ARCSEC = np.radians(1 / 3600)
 CELL, SIDE = 0.5, 96

@@ -14,10 +14,10 @@ from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import simulate  # noqa: E402
+from simulated_ms import simulate
 
-from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.private.parameters import SARACOMPARE, TSARA  # noqa: E402
+from casa_sara import saracompare, tsara
+from casa_sara.private.parameters import SARACOMPARE, TSARA
 
 REFUSALS = (ValueError, TypeError, OSError, MemoryError)  # OSError: a path that is not there, or not to be written
 EXAMPLES, OF_SLOW = 6, 2

@@ -109,7 +109,7 @@ def test_a_disk_without_room_is_refused_before_and_after_the_solution(vis, tmp_p
                            match=r"imagename = '.*', imsize = .*: the images take 2.1 MB, '.*' has 1.0 MB left"):
             tsara(vis=vis, imagename=str(disk / "source"), niter=0, **GRID)
         filler.unlink()
-        monkeypatch.setattr("casa_sara.imaging.continuum.fit_beam", lambda *args: fill(disk, 1_000_000) and {})
+        monkeypatch.setattr("casa_sara.imaging.plane_images.fit_beam", lambda *args: fill(disk, 1_000_000) and {})
         with pytest.raises(OSError,
                            match=r"imagename = '.*', imsize = .*: the images take 2.1 MB, '.*' has 1.0 MB left"):
             tsara(vis=vis, imagename=str(disk / "source"), niter=0, **GRID)
@@ -128,9 +128,7 @@ def test_temporary_files_without_room(vis, tmp_path, monkeypatch):
 
 def test_a_failure_of_casa_is_told_in_its_words(tmp_path):
     with pytest.raises(ChildError, match="missing 5 required positional arguments: 'csys'"):
-        in_child(products.write_images, root=str(tmp_path / "x"), plane={}, images={}, sumwt=1.0, beam={},
-                 restoringbeam=None,
-                 history=[])
+        in_child(products.write_images, root=str(tmp_path / "x"), plane={}, images={}, sumwt=1.0, beam={}, output={})
     with pytest.raises(ChildError, match="posixpath:join is no function of casa_sara"):
         in_child(os.path.join)
 

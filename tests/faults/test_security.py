@@ -10,11 +10,11 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-import casa_sara  # noqa: E402
-from casa_sara import saracompare  # noqa: E402
-from casa_sara.analysis.convergence import block_noise, convergence  # noqa: E402
-from casa_sara.casa.images.record import read_record  # noqa: E402
-from casa_sara.runtime import jsonfile  # noqa: E402
+import casa_sara
+from casa_sara import saracompare
+from casa_sara.analysis.convergence import block_noise, convergence
+from casa_sara.casa.images.record import read_record
+from casa_sara.runtime import jsonfile
 
 PACKAGE = Path(casa_sara.__file__).parent
 MODULES = sorted(path.relative_to(PACKAGE).as_posix() for path in PACKAGE.rglob("*.py"))

@@ -14,14 +14,14 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import column, edit, pixels  # noqa: E402
-from spoiled import GRID, lacking, observe, put, remake, without  # noqa: E402
-from test_bad_data import assert_refused, contents  # noqa: E402
+from simulated_ms import column, edit, pixels
+from spoiled import GRID, lacking, observe, put, remake, without
+from test_bad_data import assert_refused, contents
 
-from casa_sara import saracompare, tsara  # noqa: E402
-from casa_sara.analysis.folder import PAGE  # noqa: E402
-from casa_sara.casa.images.sky_image import read_sky_image  # noqa: E402
-from casa_sara.casa.ms.subtables import readable  # noqa: E402
+from casa_sara import saracompare, tsara
+from casa_sara.analysis.folder import PAGE
+from casa_sara.casa.images.sky_image import read_sky_image
+from casa_sara.casa.ms.subtables import readable
 
 NAME = "J\u00fcrgen"
 LONGEST_S = 200  # of all cases together, which take half a minute

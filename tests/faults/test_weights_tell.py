@@ -9,14 +9,14 @@ import pytest
 
 casatools = pytest.importorskip("casatools")
 
-from simulated_ms import column, edit, pixels  # noqa: E402
-from spoiled import ARCSEC, observe  # noqa: E402
+from simulated_ms import column, edit, pixels
+from spoiled import ARCSEC, observe
 
-from casa_sara import tsara  # noqa: E402
-from casa_sara.casa.ms import read as reader  # noqa: E402
-from casa_sara.casa.ms.usable_samples import Usability  # noqa: E402
-from casa_sara.options import Selection  # noqa: E402
-from casa_sara.parallel.serial import Serial  # noqa: E402
+from casa_sara import tsara
+from casa_sara.casa.ms import read as reader
+from casa_sara.casa.ms.usable_samples import Usability
+from casa_sara.options import Selection
+from casa_sara.parallel.serial import Serial
 
 HEAVY_ROW, STRONG_ROW = 7, 19  # among the good rows
 

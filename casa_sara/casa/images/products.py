@@ -11,6 +11,7 @@ import math
 import os
 import shutil
 from contextlib import contextmanager
+from dataclasses import asdict
 
 import numpy as np
 
@@ -19,6 +20,7 @@ from casa_sara.casa.images.image_plane import ImagePlane
 from casa_sara.casa.images.restore import restore, write_corrected
 from casa_sara.casa.runtime.child_process import ChildError, in_child
 from casa_sara.casa.runtime.tools import opened
+from casa_sara.options import Output
 from casa_sara.runtime import jsonfile
 from casa_sara.runtime.atomic import new_files, recover_files, sync
 from casa_sara.version import __version__
@@ -125,8 +127,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     with new_products(output.imagename) as root:
         try:
             in_child(write_images, child, root=root, plane=vars(plane), images=images,
-                     sumwt=np.asarray(sumwt, np.float32),
-                     beam=beam, restoringbeam=output.restoringbeam, history=output.history, pbcor=output.pbcor)
+                     sumwt=np.asarray(sumwt, np.float32), beam=beam, output=asdict(output))
             if record is not None:
                 jsonfile.save(root + RECORD, record)
             sync(os.path.dirname(root))
@@ -135,23 +136,23 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
                                error) from error
 
 
-def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor=False):
+def write_images(root, plane, images, sumwt, beam, output):
     """Write the images under the name `root`: what `write_products` has a child process do."""
-    plane = ImagePlane(**plane)
+    plane, output = ImagePlane(**plane), Output(**output)
     write_image(root + ".psf", images["psf"], plane, beam=beam)
     write_image(root + ".residual", images["residual"], plane, masked=plane.masks_all)
     write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
     write_image(root + ".pb", plane.pb, plane, masked=True)
     write_image(root + ".sumwt", sumwt.reshape(-1, 1, 1), plane)
-    if restoringbeam is not None:
-        restore(root, restoringbeam, "cube" if plane.pb.ndim == 3 else "mfs")
+    if output.restoringbeam is not None:
+        restore(root, output.restoringbeam, "cube" if plane.pb.ndim == 3 else "mfs")
     if "mask" in images:
         write_image(root + ".mask", images["mask"], plane)
-    if pbcor:
+    if output.pbcor:
         write_corrected(root, plane, images["model"])
     for path in existing_products(root):
         with opened("image", path) as ia:
-            ia.sethistory(origin="tsara", history=list(history))
+            ia.sethistory(origin="tsara", history=list(output.history))
 
 
 def _not_written(imagename, needed, scratch, error):

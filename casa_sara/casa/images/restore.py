@@ -133,6 +133,6 @@ def write_corrected(root, plane, model):
         beam = ia.restoringbeam()
     if "beams" in beam:
         beam = [beam["beams"][f"*{k}"]["*0"] for k in range(plane.channels)]
-    for name, pixels, unit, beam in ((".image", image, "Jy/beam", beam), (".model", model, "Jy/pixel", None)):
+    for name, pixels, unit, restored_with in ((".image", image, "Jy/beam", beam), (".model", model, "Jy/pixel", None)):
         corrected = np.divide(pixels, plane.pb, out=np.zeros_like(pixels), where=plane.mask)
-        write_image(f"{root}{name}.pbcor", corrected, plane, unit=unit, beam=beam, masked=True)
+        write_image(f"{root}{name}.pbcor", corrected, plane, unit=unit, beam=restored_with, masked=True)

@@ -1,0 +1,82 @@
+"""The images of one plane that are not solved for: PSF, residual, the sum of the weights and the fitted beam."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from casa_sara.casa.images.restore import fit_beam
+from casa_sara.casa.ms.weights import dirty_image, imaging_weights, sum_of_weights
+from casa_sara.operators.measurement import Summed
+from casa_sara.operators.sky import sky_operator
+from casa_sara.parallel.serial import SERIAL
+
+__all__ = ["IMAGE_EPS", "PlaneImages", "plane_images", "point_spread"]
+
+IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
+
+
+@dataclass
+class PlaneImages:
+    """The images of one plane: `pixels` are 'psf', 'residual', 'model', float32 (nx, ny); `weights` (M,) made them."""
+
+    pixels: dict[str, np.ndarray]
+    weights: np.ndarray
+    sumwt: float
+    beam: dict
+
+    @property
+    def residual_peak(self) -> float:
+        """Largest absolute pixel of the residual, Jy/beam."""
+        return float(np.abs(self.pixels["residual"]).max())
+
+    @property
+    def model_flux(self) -> float:
+        """Flux of the model, Jy."""
+        return float(self.pixels["model"].sum(dtype=float))
+
+
+def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
+    """Return the `PlaneImages` of a model (nx, ny) in Jy/pixel and the samples it was made of.
+
+    Parameters
+    ----------
+    data : Visibilities
+    model : real (nx, ny)
+        Jy/pixel.
+    grid : ImageGrid
+    weighting : Weighting
+    options : SolverOptions
+        Whose number of threads is used.
+    plane : ImagePlane
+        For the beam.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    PlaneImages
+    """
+    weights, operator, psf, beam = point_spread(data, grid, weighting, options, plane, comm)
+    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
+    if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too
+        sumwt = float(weights.sum(dtype=float))
+    else:
+        sumwt = sum_of_weights(data, weights, grid.stokes)
+    return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, comm.total(sumwt), beam)
+
+
+def _predicted(operator, data, grid, options, model, comm):
+    """Return the visibilities of a model, by the operator of the dirty images unless there is a spectrum."""
+    if grid.spectrum is not None:
+        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm)
+    return operator.forward(model)
+
+
+def point_spread(data, grid, weighting, options, plane, comm):
+    """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and its fitted beam."""
+    weights = imaging_weights(data, grid, weighting, comm)
+    operator = Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm), comm)
+    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
+    return weights, operator, psf, comm.once(fit_beam, psf, plane)
