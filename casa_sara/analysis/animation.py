@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -17,7 +18,8 @@ __all__ = ["animate", "has_emission"]
 SIDE = 4.2  # of a square frame without its labels, in inches
 
 
-def animate(path, frames: Sequence[tuple[str, np.ndarray, float]], zoom=None, decades=3.0, seconds=1.2) -> None:
+def animate(path: str | Path, frames: Sequence[tuple[str, np.ndarray, float]],
+            zoom: tuple[float, float, float] | None = None, decades: float = 3.0, seconds: float = 1.2) -> None:
     """Write an animation over reconstructions of one sky with different pixels.
 
     Parameters
@@ -48,8 +50,20 @@ def animate(path, frames: Sequence[tuple[str, np.ndarray, float]], zoom=None, de
     drawn[0].save(path, save_all=True, append_images=drawn[1:], duration=waits, loop=0)
 
 
-def has_emission(frames, zoom) -> bool:
-    """Tell whether every frame has emission in the part of the sky that `animate` would show of it."""
+def has_emission(frames: Sequence[tuple[str, np.ndarray, float]], zoom: tuple[float, float, float] | None) -> bool:
+    """Tell whether every frame has emission in the part of the sky that `animate` would show of it.
+
+    Parameters
+    ----------
+    frames : sequence of (str, ndarray, float)
+        Title, model (nx, ny) in Jy/pixel and pixel size in arcsec.
+    zoom : (float, float, float) or None
+        Centre in arcsec to the east and to the north, and side in arcsec; None as in `animate`.
+
+    Returns
+    -------
+    bool
+    """
     return all(_peak(image, cell, _part(frames, zoom)) > 0 for _, image, cell in frames)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +40,17 @@ class Frame:
         return self._wcs(self.cell_arcsec[1])
 
     def square_x(self, x: np.ndarray) -> np.ndarray:
-        """Return pixel coordinates x on the square pixels."""
+        """Return pixel coordinates x on the square pixels.
+
+        Parameters
+        ----------
+        x : float or float (n,)
+            Pixel coordinates along x.
+
+        Returns
+        -------
+        float or float (n,)
+        """
         middle = self.shape[0] // 2
         return (x - middle) * self.cell_arcsec[0] / self.cell_arcsec[1] + middle
 
@@ -54,7 +65,7 @@ class Frame:
         return wcs
 
 
-def region_masks(texts, frame: Frame, parameter="regions") -> dict[str, np.ndarray]:
+def region_masks(texts: Sequence[str], frame: Frame, parameter: str = "regions") -> dict[str, np.ndarray]:
     """Return the regions as masks, by name.
 
     A region's name is what stands before ' = ', else its label in the file, else the text or the file's name; a
@@ -65,6 +76,7 @@ def region_masks(texts, frame: Frame, parameter="regions") -> dict[str, np.ndarr
     texts : sequence of str
         Each is a circle 'RA DEC RADIUS', a line in CRTF or DS9 syntax, or the path of a file of such lines.
     frame : Frame
+        The grid of the image on the sky.
     parameter : str
         Task parameter, for messages.
 
@@ -89,8 +101,22 @@ def region_masks(texts, frame: Frame, parameter="regions") -> dict[str, np.ndarr
     return masks
 
 
-def places(texts, frame: Frame, parameter) -> dict[str, tuple[float, float]]:
+def places(texts: Sequence[str], frame: Frame, parameter: str) -> dict[str, tuple[float, float]]:
     """Return positions 'RA DEC' as pixel coordinates, by their texts.
+
+    Parameters
+    ----------
+    texts : sequence of str
+        Each is 'RA DEC', as '19h59m28.4s +40d44m02s'.
+    frame : Frame
+        The grid of the image on the sky.
+    parameter : str
+        Task parameter, for messages.
+
+    Returns
+    -------
+    dict
+        Text → (x, y), pixels.
 
     Raises
     ------

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -24,8 +26,20 @@ class Table:
     caption: str = ""
 
 
-def number(value, digits: int = 4) -> str:
-    """Return a number with some significant digits; a dash for what there is not, ∞ for infinity."""
+def number(value: object, digits: int = 4) -> str:
+    """Return a number with some significant digits; a dash for what there is not, ∞ for infinity.
+
+    Parameters
+    ----------
+    value : float, str or None
+        What is written.
+    digits : int
+        Number of significant digits.
+
+    Returns
+    -------
+    str
+    """
     if value is None or isinstance(value, float) and np.isnan(value):
         return NOTHING
     if not isinstance(value, (int, float, np.number)):
@@ -39,8 +53,26 @@ def number(value, digits: int = 4) -> str:
     return f"{value:,.{decimals}f}".replace("-", "−")
 
 
-def build(title, columns, measured, caption="") -> Table | None:
-    """Make a table of products from columns (key, head, unit), leaving out what no product has."""
+def build(title: str, columns: Sequence[tuple[Any, str, str]], measured: dict[str, dict[Any, Any]],
+          caption: str = "") -> Table | None:
+    """Make a table of products from columns (key, head, unit), leaving out what no product has.
+
+    Parameters
+    ----------
+    title : str
+        Title.
+    columns : sequence of (str, str, str)
+        Key of the measure, head of the column, unit.
+    measured : dict
+        Name of the product → its measures by key.
+    caption : str
+        Explanation below the table.
+
+    Returns
+    -------
+    Table or None
+        None where no product has any of the measures.
+    """
     columns = [column for column in columns if any(column[0] in entry for entry in measured.values())]
     if not columns:
         return None
@@ -77,11 +109,33 @@ def _column(values, unit, scales) -> tuple[str, list[str]]:
     return sign + unit, [fixed(value, decimals) for value in values]
 
 
-def is_number(value) -> bool:
-    """Tell whether a value is a finite number."""
+def is_number(value: object) -> bool:
+    """Tell whether a value is a finite number.
+
+    Parameters
+    ----------
+    value : object
+        Anything.
+
+    Returns
+    -------
+    bool
+    """
     return isinstance(value, (int, float, np.number)) and bool(np.isfinite(value))
 
 
-def fixed(value, decimals) -> str:
-    """Return a number with some decimals."""
+def fixed(value: float | None, decimals: int) -> str:
+    """Return a number with some decimals.
+
+    Parameters
+    ----------
+    value : float or None
+        What is written.
+    decimals : int
+        Number of decimals.
+
+    Returns
+    -------
+    str
+    """
     return f"{value:,.{decimals}f}".replace("-", "−") if is_number(value) else number(value)

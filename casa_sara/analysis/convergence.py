@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.lines import Line2D
 
+from casa_sara.analysis.comparison import Product
 from casa_sara.analysis.diagnostics import SMALL, TEXT, legend, new_figure
 from casa_sara.analysis.sheets import LINES, plain
 
@@ -18,10 +19,21 @@ LONGEST = 26  # letters of the name of a MeasurementSet
 LONG_GAP_S = 3 * 3600.0
 
 
-def convergence(path, product) -> bool:
+def convergence(path: str | Path, product: Product) -> bool:
     """Draw relative change, residual norm and bounds against the iteration; tell whether any was recorded.
 
     Vertical lines mark the re-weightings, numbered from 1.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    product : casa_sara.analysis.comparison.Product
+        The product whose record is drawn.
+
+    Returns
+    -------
+    bool
     """
     record = product.record
     history, bounds = record.get("history") or {}, record.get("bounds") or []
@@ -114,11 +126,22 @@ def _steps(record, end):
     return np.array([*x, max(end, x[-1])]), np.array([*bounds, bounds[-1]])
 
 
-def block_noise(path, product) -> bool:
+def block_noise(path: str | Path, product: Product) -> bool:
     """Draw the noise found and measured in each block over time; tell whether there are blocks.
 
     A panel for each MeasurementSet (one configuration, as a rule), with time running along it; gaps of
     more than three hours are cut out. Names along the upper edge are scans.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    product : casa_sara.analysis.comparison.Product
+        The product whose record is drawn.
+
+    Returns
+    -------
+    bool
     """
     blocks = [block for block in product.record.get("blocks") or [] if "noise_found" in block]
     if not blocks:

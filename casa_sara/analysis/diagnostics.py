@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from scipy.signal.windows import tukey
 
+from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.sheets import DPI, line, plain
 
 __all__ = ["histograms", "legend", "new_figure", "radial_spectrum", "spectra"]
@@ -16,8 +23,27 @@ WEIGHTINGS = ("natural", "briggs")
 REACH = 8.0  # of a histogram, in standard deviations
 
 
-def new_figure(rows: int, columns: int, height: float, width: float = 7.0, **options):
-    """Return a figure, 11.5 inches wide at most, and its axes (rows, columns); `height` inches for each row."""
+def new_figure(rows: int, columns: int, height: float, width: float = 7.0, **options: Any) -> tuple[Figure, np.ndarray]:
+    """Return a figure, 11.5 inches wide at most, and its axes (rows, columns); `height` inches for each row.
+
+    Parameters
+    ----------
+    rows : int
+        Number of rows of panels.
+    columns : int
+        Number of columns of panels.
+    height : float
+        Of a row, inches.
+    width : float
+        Of a column, inches.
+    **options : object
+        Options of matplotlib's subplots.
+
+    Returns
+    -------
+    figure : matplotlib Figure
+    axes : array of matplotlib Axes (rows, columns)
+    """
     size = min(11.5, width * columns), rows * height
     figure = Figure(figsize=size, dpi=DPI, facecolor="white", layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False, **options)
@@ -29,15 +55,24 @@ def new_figure(rows: int, columns: int, height: float, width: float = 7.0, **opt
     return figure, axes
 
 
-def legend(figure, handles) -> None:
-    """Put one legend for all panels below them; handles of one label appear once."""
+def legend(figure: Figure, handles: Sequence[Artist]) -> None:
+    """Put one legend for all panels below them; handles of one label appear once.
+
+    Parameters
+    ----------
+    figure : matplotlib Figure
+        The figure.
+    handles : sequence of matplotlib artists
+        What has been drawn, with labels.
+    """
     unique = {handle.get_label(): handle for handle in handles}
     columns = max(1, min(len(unique), 130 // (max(map(len, unique)) + 8)))
     figure.legend(handles=list(unique.values()), loc="outside lower center", ncols=columns, fontsize=SMALL,
                   frameon=False)
 
 
-def radial_spectrum(image, cell_arcsec, window: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def radial_spectrum(image: npt.ArrayLike, cell_arcsec: tuple[float, float],
+                    window: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """Return the power of an image averaged over rings of the Fourier plane.
 
     Parameters
@@ -45,6 +80,7 @@ def radial_spectrum(image, cell_arcsec, window: bool = False) -> tuple[np.ndarra
     image : array_like (nx, ny)
         Blank pixels count as zero.
     cell_arcsec : (float, float)
+        Pixel size along x and y in arcsec.
     window : bool
         Taper the outer tenth, for images that do not fade out towards their edge. The power is that of the
         image without the taper, if it looks the same all over.
@@ -76,10 +112,21 @@ def radial_spectrum(image, cell_arcsec, window: bool = False) -> tuple[np.ndarra
     return np.flatnonzero(filled) * width, mean[filled]
 
 
-def spectra(path, comparison) -> bool:
+def spectra(path: str | Path, comparison: Comparison) -> bool:
     """Draw the amplitude of the models against spatial frequency, and the power of each kind of residuals.
 
     Tell whether anything was there to draw.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    bool
     """
     images = [(product.name, product.model, line(number)) for number, product in enumerate(comparison.products)]
     if comparison.truth is not None:
@@ -139,8 +186,20 @@ def _has_noise(product, weighting) -> bool:
     return weighting in product.residual and np.nanstd(product.residual[weighting]) > 0
 
 
-def histograms(path, comparison) -> bool:
-    """Draw the histograms of the residuals against the Gaussian; tell whether there are residuals."""
+def histograms(path: str | Path, comparison: Comparison) -> bool:
+    """Draw the histograms of the residuals against the Gaussian; tell whether there are residuals.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    bool
+    """
     weightings = [w for w in WEIGHTINGS if any(_has_noise(product, w) for product in comparison.products)]
     if not weightings:
         return False

@@ -26,6 +26,10 @@ def replaced(folder: Path) -> Iterator[Path]:
     folder : Path
         Made if it is not there, but not kept empty.
 
+    Yields
+    ------
+    Path
+
     Raises
     ------
     FileExistsError
@@ -47,13 +51,31 @@ def replaced(folder: Path) -> Iterator[Path]:
 
 
 def in_the_way(folder: Path, names: Iterable[str]) -> list[str]:
-    """Return those of the names that stand in the folder and are not of an earlier report."""
+    """Return those of the names that stand in the folder and are not of an earlier report.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of a report.
+    names : iterable of str
+        Names of files.
+
+    Returns
+    -------
+    list of str
+    """
     own = _own(folder)
     return [name for name in names if os.path.lexists(folder / name) and name not in own]
 
 
 def remove(folder: Path) -> None:
-    """Remove the files of a report, and the folder where it holds no others; nothing where there is none."""
+    """Remove the files of a report, and the folder where it holds no others; nothing where there is none.
+
+    Parameters
+    ----------
+    folder : Path
+        The folder of a report.
+    """
     for name in _own(folder):
         (folder / name).unlink()
     if folder.is_dir() and not os.listdir(folder):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
@@ -16,12 +17,14 @@ __all__ = ["measure", "source_support"]
 SCALES = (0.25, 0.5, 1.0, 2.0, 4.0)  # of the beam, at which a model is compared with the truth
 
 
-def source_support(models, truth, threshold, beam, cell_arcsec) -> np.ndarray:
+def source_support(models: Sequence[np.ndarray], truth: np.ndarray | None, threshold: float,
+                   beam: tuple[float, float, float], cell_arcsec: tuple[float, float]) -> np.ndarray:
     """Return where the source is: the same for all models, so that none declares its own artefacts to be source.
 
     Parameters
     ----------
     models : sequence of (nx, ny)
+        Jy/pixel, on one grid.
     truth : (nx, ny) or None
         Used in place of the models when there is one.
     threshold : float
@@ -29,6 +32,7 @@ def source_support(models, truth, threshold, beam, cell_arcsec) -> np.ndarray:
     beam : (float, float, float)
         Major and minor axis in arcsec, position angle in degrees, to which all are smoothed first.
     cell_arcsec : (float, float)
+        Pixel size along x and y in arcsec.
 
     Returns
     -------
@@ -41,7 +45,9 @@ def source_support(models, truth, threshold, beam, cell_arcsec) -> np.ndarray:
     return middle > threshold * middle.max()
 
 
-def measure(products, cell_arcsec, beams, truth, support, regions, chi_square=None) -> dict[str, Any]:
+def measure(products: Sequence[Product], cell_arcsec: tuple[float, float], beams: dict[str, tuple[float, float, float]],
+            truth: np.ndarray | None, support: np.ndarray, regions: dict[str, np.ndarray],
+            chi_square: dict[str, Any] | None = None) -> dict[str, Any]:
     """Take all measures.
 
     Parameters
@@ -49,11 +55,13 @@ def measure(products, cell_arcsec, beams, truth, support, regions, chi_square=No
     products : sequence of casa_sara.analysis.comparison.Product
         On one grid.
     cell_arcsec : (float, float)
+        Pixel size along x and y in arcsec.
     beams : dict
         Weighting → (major, minor) in arcsec FWHM and position angle in degrees.
     truth : (nx, ny) or None
         Jy/pixel.
     support : bool (nx, ny)
+        Where the source is.
     regions : dict
         Name → bool (nx, ny).
     chi_square : dict, optional
@@ -118,7 +126,7 @@ def _against_truth(product, truth, cell_arcsec, beams):
     """Measures of the model against the truth."""
     weighting = next(name for name in WEIGHTINGS if name in beams)
     beam, cell = np.sqrt(np.prod(beams[weighting][:2])), np.sqrt(np.prod(cell_arcsec))
-    found = {
+    found: dict[str, Any] = {
         "snr": metrics.snr(truth, product.model),
         "log_snr": metrics.log_snr(truth, product.model),
         "snr_at_scale": {
@@ -129,7 +137,7 @@ def _against_truth(product, truth, cell_arcsec, beams):
     if min(truth.shape) > 11:
         found["ssim_range_jy_per_pixel"] = float(truth.max())
         found["ssim"] = metrics.ssim(truth, product.model, found["ssim_range_jy_per_pixel"])
-    entry = {"truth": found}
+    entry: dict[str, Any] = {"truth": found}
     point = metrics.isolated_point(truth)
     if point is not None:
         width = metrics.point_width(product.model, point, max(2, round(beam / cell)), cell_arcsec)

@@ -6,6 +6,7 @@ All take plain arrays, indexed [ix, iy] with ix to the west and iy to the north.
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 from scipy.ndimage import gaussian_filter
 
 __all__ = [
@@ -16,14 +17,27 @@ __all__ = [
 FWHM_PER_SIGMA = np.sqrt(8 * np.log(2))
 
 
-def snr(truth, model) -> float:
-    """Return 20 log10(‖truth‖ / ‖truth − model‖) in dB; both of one shape and unit."""
+def snr(truth: npt.ArrayLike, model: npt.ArrayLike) -> float:
+    """Return 20 log10(‖truth‖ / ‖truth − model‖) in dB; both of one shape and unit.
+
+    Parameters
+    ----------
+    truth : array_like (nx, ny)
+        The true image.
+    model : array_like (nx, ny)
+        The image to judge.
+
+    Returns
+    -------
+    float
+        dB.
+    """
     truth, model = _alike(truth, model)
     error = np.linalg.norm(truth - model)
     return float("inf") if error == 0 else float(20 * np.log10(np.linalg.norm(truth) / error))
 
 
-def log_snr(truth, model, dynamic_range=1e3) -> float:
+def log_snr(truth: npt.ArrayLike, model: npt.ArrayLike, dynamic_range: float = 1e3) -> float:
     """Return the SNR in dB of the images on a log scale, where faint emission counts as much as bright.
 
     An image x goes to log(1 + D x⁺/p) / log(1 + D), with p the peak of the truth, D the dynamic
@@ -35,13 +49,19 @@ def log_snr(truth, model, dynamic_range=1e3) -> float:
         Images of one shape and unit.
     dynamic_range : float
         D: emission below p/D is on the linear part of the scale.
+
+    Returns
+    -------
+    float
+        dB.
     """
     truth, model = _alike(truth, model)
     scale = dynamic_range / truth.max()
     return snr(*(np.log1p(scale * np.clip(image, 0, None)) / np.log1p(dynamic_range) for image in (truth, model)))
 
 
-def smooth(image, fwhm, position_angle_deg=0.0, cell=(1.0, 1.0)) -> np.ndarray:
+def smooth(image: npt.ArrayLike, fwhm: float | tuple[float, float], position_angle_deg: float = 0.0,
+           cell: tuple[float, float] = (1.0, 1.0)) -> np.ndarray:
     """Convolve an image with a Gaussian of unit integral (the unit stays, Jy/pixel for a model).
 
     Outside of the image is zero.
@@ -72,19 +92,42 @@ def smooth(image, fwhm, position_angle_deg=0.0, cell=(1.0, 1.0)) -> np.ndarray:
     return smoothed[: image.shape[0], : image.shape[1]]
 
 
-def snr_at_scale(truth, model, fwhm, cell=(1.0, 1.0)) -> float:
-    """Return the SNR in dB of two images that are both smoothed with a round Gaussian; FWHM in the unit of `cell`."""
+def snr_at_scale(truth: npt.ArrayLike, model: npt.ArrayLike, fwhm: float,
+                 cell: tuple[float, float] = (1.0, 1.0)) -> float:
+    """Return the SNR in dB of two images that are both smoothed with a round Gaussian; FWHM in the unit of `cell`.
+
+    Parameters
+    ----------
+    truth : array_like (nx, ny)
+        The true image.
+    model : array_like (nx, ny)
+        The image to judge, in the same unit.
+    fwhm : float
+        Of the Gaussian, in the unit of `cell`.
+    cell : (float, float)
+        Pixel size.
+
+    Returns
+    -------
+    float
+        dB.
+    """
     truth, model = _alike(truth, model)
     return snr(*(smooth(image, fwhm, 0.0, cell) for image in (truth, model)))
 
 
-def similarity(one, other) -> float:
+def similarity(one: npt.ArrayLike, other: npt.ArrayLike) -> float:
     """Return S = 20 log10(max(‖one‖, ‖other‖) / ‖one − other‖) in dB, infinite for equal images.
 
     Parameters
     ----------
     one, other : array_like
         Images of one shape and unit; the paper takes models smoothed with the CLEAN beam.
+
+    Returns
+    -------
+    float
+        dB.
 
     Raises
     ------
@@ -98,19 +141,36 @@ def similarity(one, other) -> float:
     return float(20 * np.log10(max(np.linalg.norm(one), np.linalg.norm(other)) / difference))
 
 
-def dynamic_range(restored, residual) -> float:
-    """Return DR = max(restored) / standard deviation of the residual, NaN (blank) pixels left out; one unit."""
-    return float(np.nanmax(restored) / np.nanstd(residual))
+def dynamic_range(restored: npt.ArrayLike, residual: npt.ArrayLike) -> float:
+    """Return DR = max(restored) / standard deviation of the residual, NaN (blank) pixels left out; one unit.
+
+    Parameters
+    ----------
+    restored : array_like (nx, ny)
+        The restored image.
+    residual : array_like (nx, ny)
+        The residual image, in the same unit.
+
+    Returns
+    -------
+    float
+    """
+    return float(np.nanmax(restored) / np.nanstd(np.asarray(residual)))
 
 
-def model_dynamic_range(model, support) -> float:
+def model_dynamic_range(model: npt.ArrayLike, support: npt.ArrayLike) -> float:
     """Return MDR = max(model) / brightest pixel outside the support of the source, infinite if that is not positive.
 
     Parameters
     ----------
     model : array_like (nx, ny)
+        The model.
     support : bool array_like (nx, ny)
         Where the source is.
+
+    Returns
+    -------
+    float
 
     Raises
     ------
@@ -125,20 +185,36 @@ def model_dynamic_range(model, support) -> float:
     return float(model.max() / outside) if outside > 0 else float("inf")
 
 
-def beam_pixels(fwhm, cell=(1.0, 1.0)) -> float:
-    """Return the solid angle of a Gaussian beam in pixels; (major, minor) FWHM and cell (x, y) in one unit."""
+def beam_pixels(fwhm: tuple[float, float], cell: tuple[float, float] = (1.0, 1.0)) -> float:
+    """Return the solid angle of a Gaussian beam in pixels; (major, minor) FWHM and cell (x, y) in one unit.
+
+    Parameters
+    ----------
+    fwhm : (float, float)
+        Major and minor axis.
+    cell : (float, float)
+        Pixel size, in the same unit.
+
+    Returns
+    -------
+    float
+        Pixels.
+    """
     return float(np.pi * fwhm[0] * fwhm[1] / (4 * np.log(2) * cell[0] * cell[1]))
 
 
-def integrated_flux(image, mask, unit="Jy/pixel", beam=None, rms=None) -> tuple[float, float | None]:
+def integrated_flux(image: npt.ArrayLike, mask: npt.ArrayLike, unit: str = "Jy/pixel", beam: float | None = None,
+                    rms: float | None = None) -> tuple[float, float | None]:
     """Sum an image over a region.
 
     Parameters
     ----------
     image : array_like (nx, ny)
+        The image.
     mask : bool array_like (nx, ny)
         The region.
     unit : {'Jy/pixel', 'Jy/beam'}
+        Of the image.
     beam : float
         Solid angle of the beam in pixels, for Jy/beam.
     rms : float
@@ -170,7 +246,7 @@ def integrated_flux(image, mask, unit="Jy/pixel", beam=None, rms=None) -> tuple[
     return flux / beam, error
 
 
-def ssim(truth, model, value_range, sigma=1.5) -> float:
+def ssim(truth: npt.ArrayLike, model: npt.ArrayLike, value_range: float, sigma: float = 1.5) -> float:
     """Return the mean structural similarity (Wang et al. 2004), 1 for equal images.
 
     Parameters
@@ -181,6 +257,10 @@ def ssim(truth, model, value_range, sigma=1.5) -> float:
         The range L of the values, in the same unit; K1 = 0.01, K2 = 0.03.
     sigma : float
         Of the Gaussian window in pixels, which is cut at 3.5 sigma; the mean leaves out its half width at the edges.
+
+    Returns
+    -------
+    float
     """
     truth, model = _alike(truth, model)
     half = int(3.5 * sigma + 0.5)
@@ -196,8 +276,20 @@ def ssim(truth, model, value_range, sigma=1.5) -> float:
     return float(np.mean((2 * m1 * m2 + c1) * (2 * v12 + c2) / ((m1**2 + m2**2 + c1) * (v1 + v2 + c2))))
 
 
-def isolated_point(truth, guard=4) -> tuple[int, int] | None:
-    """Return the brightest pixel [ix, iy] that is alone in a square of 2·guard + 1 pixels, None if there is none."""
+def isolated_point(truth: npt.ArrayLike, guard: int = 4) -> tuple[int, int] | None:
+    """Return the brightest pixel [ix, iy] that is alone in a square of 2·guard + 1 pixels, None if there is none.
+
+    Parameters
+    ----------
+    truth : array_like (nx, ny)
+        The true image.
+    guard : int
+        Half the side of the square, pixels.
+
+    Returns
+    -------
+    (int, int) or None
+    """
     truth = np.asarray(truth, float)
     nx, ny = truth.shape
     for flat in np.argsort(truth, axis=None)[::-1][:100]:
@@ -211,7 +303,8 @@ def isolated_point(truth, guard=4) -> tuple[int, int] | None:
     return None
 
 
-def point_width(model, pixel, half_side, cell=(1.0, 1.0)) -> float | None:
+def point_width(model: npt.ArrayLike, pixel: tuple[int, int], half_side: int,
+                cell: tuple[float, float] = (1.0, 1.0)) -> float | None:
     """Return the FWHM that a point source was recovered with, from the second moments of a square around it.
 
     The geometric mean of both axes, as the covariance's determinant gives it; negative pixels count as zero. A source
@@ -220,6 +313,7 @@ def point_width(model, pixel, half_side, cell=(1.0, 1.0)) -> float | None:
     Parameters
     ----------
     model : array_like (nx, ny)
+        Jy/pixel.
     pixel : (int, int)
         Where the point source is.
     half_side : int

@@ -6,11 +6,14 @@ serves all of them; residuals, per beam, have a scale of their own.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from astropy.coordinates import SkyCoord
 from matplotlib.colors import LogNorm, Normalize
 
 from casa_sara.analysis import metrics
+from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.sheets import (
     BRIGHTNESS_MAP,
     DIFFERENCE_MAP,
@@ -31,8 +34,22 @@ DECADES = 2.5, 4.5  # the least and the most of a logarithmic scale
 PERCENTILE = 99.8  # of the differences, at the ends of their scale
 
 
-def smoothed(comparison, image, weighting: str) -> np.ndarray:
-    """Return an image in Jy/pixel convolved with the CLEAN beam of a weighting, still in Jy/pixel."""
+def smoothed(comparison: Comparison, image: np.ndarray, weighting: str) -> np.ndarray:
+    """Return an image in Jy/pixel convolved with the CLEAN beam of a weighting, still in Jy/pixel.
+
+    Parameters
+    ----------
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+    image : array_like (nx, ny)
+        Jy/pixel.
+    weighting : str
+        'natural' or 'briggs'.
+
+    Returns
+    -------
+    float64 (nx, ny)
+    """
     major, minor, angle = _in_pixels(comparison.beams[weighting], comparison.cell_arcsec)
     return metrics.smooth(np.nan_to_num(image), (major, minor), angle)
 
@@ -45,13 +62,15 @@ def _in_pixels(beam, cell) -> tuple[float, float, float]:
     return float(np.sqrt(squares[1])), float(np.sqrt(squares[0])), float(np.rad2deg(np.arctan2(*directions[:, 1])))
 
 
-def overview(path, comparison, weighting: str | None = None) -> None:
+def overview(path: str | Path, comparison: Comparison, weighting: str | None = None) -> None:
     """Draw models, smoothed models, restored and residual images, a row for the truth and for each product.
 
     Parameters
     ----------
     path : str or Path
+        File to write.
     comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
     weighting : str, optional
         Of the beam, the restored and the residual images; without it, models only.
     """
@@ -73,7 +92,7 @@ def overview(path, comparison, weighting: str | None = None) -> None:
             if kind == "model":
                 for zoom in zooms:
                     outline(panel, zoom.box)
-            else:
+            elif weighting:
                 draw_beam(panel, comparison.beams[weighting], cell, "black" if residual else "white")
     last = len(columns) - ("residual" in columns) - 1
     sheet.bar(0, last, norm, BRIGHTNESS_MAP, unit)
@@ -82,8 +101,20 @@ def overview(path, comparison, weighting: str | None = None) -> None:
     sheet.save(path)
 
 
-def zoomed(path, comparison) -> bool:
-    """Draw enlarged parts of the models, a row for the truth and for each product; tell whether there were any."""
+def zoomed(path: str | Path, comparison: Comparison) -> bool:
+    """Draw enlarged parts of the models, a row for the truth and for each product; tell whether there were any.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    bool
+    """
     zooms, cell = find_zooms(comparison), comparison.cell_arcsec
     if not zooms:
         return False
@@ -107,10 +138,21 @@ def zoomed(path, comparison) -> bool:
     return True
 
 
-def differences(path, comparison) -> bool:
+def differences(path: str | Path, comparison: Comparison) -> bool:
     """Draw each product minus the truth, or minus the first product; tell whether there was anything to subtract.
 
     The models as they are and smoothed with each beam; every column has a linear scale of its own.
+
+    Parameters
+    ----------
+    path : str or Path
+        File to write.
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    bool
     """
     products = list(comparison.products)
     if comparison.truth is None:

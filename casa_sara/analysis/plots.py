@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from matplotlib.cm import ScalarMappable
@@ -66,7 +67,8 @@ class Zoom:
     side: float
 
 
-def compare(path, columns: Sequence[Column], cell_arcsec: float, zooms: Sequence[Zoom], decades=3.5, title="") -> None:
+def compare(path: str | Path, columns: Sequence[Column], cell_arcsec: float, zooms: Sequence[Zoom],
+            decades: float = 3.5, title: str = "") -> None:
     """Draw models, restored images, residuals and enlarged parts of the models, a column for each reconstruction.
 
     Parameters
@@ -76,11 +78,13 @@ def compare(path, columns: Sequence[Column], cell_arcsec: float, zooms: Sequence
     columns : sequence of Column
         The peak of the first one's model sets the scale, so let it be the truth or the best.
     cell_arcsec : float
+        Pixel size along x and y in arcsec.
     zooms : sequence of Zoom
         Enlarged parts of the models, side by side below.
     decades : float
         Range of the logarithmic scale.
     title : str
+        Heading of the picture.
     """
     peak = 1e3 * np.max(columns[0].model) / cell_arcsec**2
     rms = 1e3 * np.median([np.nanstd(column.residual) for column in columns if column.residual is not None])

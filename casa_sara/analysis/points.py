@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 __all__ = ["recovered_point"]
 
 FINE = 9  # parts of a pixel along an axis, over which its flux is spread evenly
 
 
-def recovered_point(image, place, radius, cell=(1.0, 1.0)) -> dict[str, float]:
+def recovered_point(image: npt.ArrayLike, place: tuple[float, float], radius: float,
+                    cell: tuple[float, float] = (1.0, 1.0)) -> dict[str, float]:
     """Measure a point source in a circle around its true place.
 
     The flux is the sum F over the circle. The place found is the centroid of that flux, and the width twice the radius
@@ -20,6 +22,7 @@ def recovered_point(image, place, radius, cell=(1.0, 1.0)) -> dict[str, float]:
     Parameters
     ----------
     image : array_like (nx, ny)
+        Jy/pixel.
     place : (float, float)
         Pixel coordinates of the source.
     radius : float

@@ -57,6 +57,7 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     folder : Path
         Made if it is not there.
     title : str
+        Heading of the page.
 
     Returns
     -------
@@ -124,7 +125,7 @@ def _frames(comparison, folder) -> list[Picture]:
     """Animate the images on different pixels: the field, and the regions in which all of them have emission."""
     if not comparison.frames:
         return []
-    parts = [("the field", None)]
+    parts: list[tuple[str, tuple[float, float, float] | None]] = [("the field", None)]
     if comparison.regions:
         parts += [(zoom.name, zoom.on_sky(comparison)) for zoom in find_zooms(comparison)]
     made = []

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 
 __all__ = ["radial_power_spectrum", "residual_statistics", "whiteness"]
 
 
-def residual_statistics(residual) -> dict[str, float]:
+def residual_statistics(residual: npt.ArrayLike) -> dict[str, float]:
     """Return the statistics of a residual image.
 
     Parameters
@@ -42,7 +43,8 @@ def residual_statistics(residual) -> dict[str, float]:
     }
 
 
-def radial_power_spectrum(image, cell=(1.0, 1.0), bins=None) -> tuple[np.ndarray, np.ndarray]:
+def radial_power_spectrum(image: npt.ArrayLike, cell: tuple[float, float] = (1.0, 1.0),
+                          bins: int | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Return the power spectrum of an image, averaged over rings of spatial frequency.
 
     Parameters
@@ -75,11 +77,21 @@ def radial_power_spectrum(image, cell=(1.0, 1.0), bins=None) -> tuple[np.ndarray
     return places[there] / count[there], summed[there] / count[there]
 
 
-def whiteness(image) -> float:
+def whiteness(image: npt.ArrayLike) -> float:
     """Return geometric over arithmetic mean of the radial power spectrum: 1 when all scales are alike, else less.
 
     A residual image of pure noise is as white as the sampling of the uv plane lets it be, so this compares
     residuals of one operator and weighting.
+
+    Parameters
+    ----------
+    image : array_like (nx, ny)
+        A residual image.
+
+    Returns
+    -------
+    float
+        From 0 to 1.
     """
     _, power = radial_power_spectrum(image)
     if not power.min() > 0:

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 from astropy.wcs import WCS
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.transforms import Affine2D
+
+from casa_sara.analysis.comparison import Comparison
 
 __all__ = ["BRIGHTNESS_MAP", "DIFFERENCE_MAP", "DPI", "LINES", "Sheet", "beam_area", "celestial", "draw", "draw_beam",
            "line", "outline", "plain", "prefix"]
@@ -30,31 +35,84 @@ TEXT = {"fontsize": 9.5}
 
 
 def line(number: int) -> dict[str, str]:
-    """Return colour and style of the line of the product of this number."""
+    """Return colour and style of the line of the product of this number.
+
+    Parameters
+    ----------
+    number : int
+        Of the product, from 0.
+
+    Returns
+    -------
+    dict
+        Options of matplotlib's plot.
+    """
     return {"color": LINES[number % len(LINES)], "ls": ("-", "--", "-.", ":")[number // len(LINES) % 4]}
 
 
-def plain(text) -> str:
-    """Return a text that matplotlib prints as it is: names may hold dollar signs, or start with an underscore."""
+def plain(text: object) -> str:
+    """Return a text that matplotlib prints as it is: names may hold dollar signs, or start with an underscore.
+
+    Parameters
+    ----------
+    text : str
+        Any text.
+
+    Returns
+    -------
+    str
+    """
     text = str(text).replace("$", r"\$")
     return f" {text}" if text.startswith("_") else text
 
 
 def prefix(value: float) -> tuple[float, str]:
-    """Return the factor and the prefix of the unit that bring a positive value to between 1 and 1000."""
+    """Return the factor and the prefix of the unit that bring a positive value to between 1 and 1000.
+
+    Parameters
+    ----------
+    value : float
+        A positive value in the unit.
+
+    Returns
+    -------
+    factor : float
+    prefix : str
+    """
     for factor, sign in ((1.0, ""), (1e3, "m"), (1e6, "µ")):
         if value * factor >= 1:
             return factor, sign
     return 1e9, "n"
 
 
-def beam_area(beam) -> float:
-    """Return the solid angle of a Gaussian beam (arcsec, arcsec, degrees) in arcsec²."""
+def beam_area(beam: tuple[float, float, float]) -> float:
+    """Return the solid angle of a Gaussian beam (arcsec, arcsec, degrees) in arcsec².
+
+    Parameters
+    ----------
+    beam : (float, float, float)
+        Major and minor FWHM in arcsec, position angle in degrees from north through east.
+
+    Returns
+    -------
+    float
+        arcsec².
+    """
     return np.pi * beam[0] * beam[1] / (4 * np.log(2))
 
 
-def celestial(comparison) -> WCS:
-    """Return the coordinates of the grid of a comparison (SIN projection, ICRS)."""
+def celestial(comparison: Comparison) -> WCS:
+    """Return the coordinates of the grid of a comparison (SIN projection, ICRS).
+
+    Parameters
+    ----------
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    astropy WCS
+    """
     nx, ny = comparison.products[0].model.shape
     wcs = WCS(naxis=2)
     wcs.wcs.ctype = ["RA---SIN", "DEC--SIN"]
@@ -113,8 +171,22 @@ class Sheet:
         wide, high = self.size
         return self.figure.add_axes([left / wide, 1 - (top + height) / high, width / wide, height / high], **options)
 
-    def panel(self, row: int, column: int, lowest: bool | None = None):
-        """Return new axes; labelled along the left edge of the sheet and below the lowest panel of a column."""
+    def panel(self, row: int, column: int, lowest: bool | None = None) -> Axes:
+        """Return new axes; labelled along the left edge of the sheet and below the lowest panel of a column.
+
+        Parameters
+        ----------
+        row : int
+            From 0 at the top.
+        column : int
+            From 0 on the left.
+        lowest : bool, optional
+            Whether the panel is the lowest of its column; that of the last row by default.
+
+        Returns
+        -------
+        matplotlib Axes
+        """
         lowest = row == len(self.rows) - 1 if lowest is None else lowest
         left, top = self.left + column * (self.side + GAP), TOP + row * self.step + HEADING
         options = {"projection": self.wcs} if self.wcs else {}
@@ -132,8 +204,22 @@ class Sheet:
                 axis.set_axislabel(name, minpad=0.4 if name == "Dec" else 0.6, **TEXT)
         return axes
 
-    def bar(self, first: int, last: int, norm, colours: str, unit: str) -> None:
-        """Draw a colour bar below the columns first … last."""
+    def bar(self, first: int, last: int, norm: Normalize, colours: str, unit: str) -> None:
+        """Draw a colour bar below the columns first … last.
+
+        Parameters
+        ----------
+        first : int
+            First column above the bar.
+        last : int
+            Last column above the bar.
+        norm : matplotlib Normalize
+            Scale of the panels.
+        colours : str
+            Name of the colour map.
+        unit : str
+            Label of the bar.
+        """
         width = (last - first + 1) * (self.side + GAP) - GAP
         inset = min(0.15, 0.05 * width)
         left = self.left + first * (self.side + GAP) + inset
@@ -144,13 +230,34 @@ class Sheet:
         if not isinstance(norm, LogNorm):
             axes.locator_params(axis="x", nbins=5)
 
-    def save(self, path) -> None:
-        """Write the sheet."""
+    def save(self, path: str | Path) -> None:
+        """Write the sheet.
+
+        Parameters
+        ----------
+        path : str or Path
+            File to write.
+        """
         self.figure.savefig(path)
 
 
-def draw(axes, image, norm: Normalize, cell, colours: str = BRIGHTNESS_MAP) -> None:
-    """Draw an image (nx, ny) in pixel coordinates, in the proportions of the sky; what cannot be drawn is grey."""
+def draw(axes: Axes, image: npt.ArrayLike, norm: Normalize, cell: tuple[float, float],
+         colours: str = BRIGHTNESS_MAP) -> None:
+    """Draw an image (nx, ny) in pixel coordinates, in the proportions of the sky; what cannot be drawn is grey.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+        Axes of the panel.
+    image : array_like (nx, ny)
+        The image.
+    norm : matplotlib Normalize
+        Its scale.
+    cell : (float, float)
+        Pixel size, for the proportions.
+    colours : str
+        Name of the colour map.
+    """
     shown = np.ma.masked_invalid(np.asarray(image, float))
     if isinstance(norm, LogNorm):
         shown = np.ma.maximum(shown, norm.vmin)
@@ -158,8 +265,23 @@ def draw(axes, image, norm: Normalize, cell, colours: str = BRIGHTNESS_MAP) -> N
     axes.imshow(shown.T, origin="lower", norm=norm, cmap=shades, aspect=cell[1] / cell[0])
 
 
-def draw_beam(axes, beam, cell, colour: str = "white", right: bool = False) -> None:
-    """Draw a beam (arcsec, arcsec, degrees from north through east) into a lower corner of the axes."""
+def draw_beam(axes: Axes, beam: tuple[float, float, float], cell: tuple[float, float], colour: str = "white",
+              right: bool = False) -> None:
+    """Draw a beam (arcsec, arcsec, degrees from north through east) into a lower corner of the axes.
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+        Axes of the panel.
+    beam : (float, float, float)
+        Major and minor FWHM in arcsec, position angle in degrees from north through east.
+    cell : (float, float)
+        Pixel size in arcsec.
+    colour : str
+        Of the line.
+    right : bool
+        In the lower right corner instead of the left one.
+    """
     (x0, x1), y0 = axes.get_xlim(), axes.get_ylim()[0]
     away = 0.55 * beam[0] + 0.025 * abs(x1 - x0) * cell[0]
     x, y = (x1 - away / cell[0] if right else x0 + away / cell[0]), y0 + away / cell[1]
@@ -169,7 +291,17 @@ def draw_beam(axes, beam, cell, colour: str = "white", right: bool = False) -> N
     axes.add_patch(ellipse)
 
 
-def outline(axes, box: tuple[int, int, int, int], colour: str = "0.8") -> None:
-    """Outline the pixels x0 … x1 − 1, y0 … y1 − 1, with the box as (x0, x1, y0, y1)."""
+def outline(axes: Axes, box: tuple[int, int, int, int], colour: str = "0.8") -> None:
+    """Outline the pixels x0 … x1 − 1, y0 … y1 − 1, with the box as (x0, x1, y0, y1).
+
+    Parameters
+    ----------
+    axes : matplotlib Axes
+        Axes of the panel.
+    box : (int, int, int, int)
+        x0, x1, y0, y1.
+    colour : str
+        Of the line.
+    """
     x0, x1, y0, y1 = box
     axes.add_patch(Rectangle((x0 - 0.5, y0 - 0.5), x1 - x0, y1 - y0, fill=False, color=colour, lw=0.8))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from casa_sara.analysis.columns import Table, build, fixed, is_number, number
+from casa_sara.analysis.comparison import Comparison
 
 __all__ = ["as_text", "tables"]
 
@@ -18,12 +21,17 @@ REGION_TABLES = (
 )
 
 
-def tables(comparison) -> list[Table]:
+def tables(comparison: Comparison) -> list[Table]:
     """Return the tables for which there are measures.
 
     Parameters
     ----------
     comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    list of Table
     """
     measured = comparison.measures.get("products", {})
     names = [product.name for product in comparison.products if product.name in measured]
@@ -34,8 +42,18 @@ def tables(comparison) -> list[Table]:
     return [table for table in made if table is not None]
 
 
-def as_text(comparison) -> str:
-    """Return all tables of a comparison as text for a terminal."""
+def as_text(comparison: Comparison) -> str:
+    """Return all tables of a comparison as text for a terminal.
+
+    Parameters
+    ----------
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    str
+    """
     parts = [_layout(table) for table in tables(comparison)]
     parts += [f"note: {note}" for note in comparison.notes]
     return "\n\n".join(parts) + "\n" if parts else "nothing was measured\n"
@@ -122,8 +140,9 @@ def _truth(measured):
         name: {**entry, **{("scale", scale): value for scale, value in entry.get("snr_at_scale", {}).items()}}
         for name, entry in entries.items()
     }
-    columns = [("snr", "SNR", "dB"), ("log_snr", "log SNR", "dB"), ("ssim", "SSIM", ""),
-               ("ssim_range_jy_per_pixel", "its range", "Jy/pixel")]
+    columns: list[tuple[Any, str, str]] = [
+        ("snr", "SNR", "dB"), ("log_snr", "log SNR", "dB"), ("ssim", "SSIM", ""),
+        ("ssim_range_jy_per_pixel", "its range", "Jy/pixel")]
     columns += [(("scale", scale), f'SNR at {float(scale):.3g}"', "dB") for scale in scales]
     caption = (
         "SNR: norm of the truth over that of the error. Log SNR: the same of the images on a logarithmic scale, where "

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, maximum_filter
 
+from casa_sara.analysis.comparison import Comparison
+
 __all__ = ["Zoom", "find_zooms", "reference"]
 
 MOST = 4
@@ -21,23 +23,55 @@ class Zoom:
     name: str
     box: tuple[int, int, int, int]
 
-    def on_sky(self, comparison) -> tuple[float, float, float]:
-        """Return its centre in arcsec to the east and to the north of the grid's, and its side in arcsec."""
+    def on_sky(self, comparison: Comparison) -> tuple[float, float, float]:
+        """Return its centre in arcsec to the east and to the north of the grid's, and its side in arcsec.
+
+        Parameters
+        ----------
+        comparison : casa_sara.analysis.comparison.Comparison
+            The products and what was measured.
+
+        Returns
+        -------
+        (float, float, float)
+            arcsec.
+        """
         x0, x1, y0, y1 = self.box
         (nx, ny), cell = comparison.products[0].model.shape, comparison.cell_arcsec
         east, north = (nx // 2 - (x0 + x1 - 1) / 2) * cell[0], ((y0 + y1 - 1) / 2 - ny // 2) * cell[1]
         return east, north, max((x1 - x0) * cell[0], (y1 - y0) * cell[1])
 
 
-def reference(comparison) -> np.ndarray:
-    """Return the model that sets scales and zooms, Jy/pixel: the truth, or the first product's."""
+def reference(comparison: Comparison) -> np.ndarray:
+    """Return the model that sets scales and zooms, Jy/pixel: the truth, or the first product's.
+
+    Parameters
+    ----------
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+
+    Returns
+    -------
+    float64 (nx, ny)
+    """
     return comparison.products[0].model if comparison.truth is None else comparison.truth
 
 
-def find_zooms(comparison, most: int = MOST) -> list[Zoom]:
+def find_zooms(comparison: Comparison, most: int = MOST) -> list[Zoom]:
     """Return the boxes around the regions of a comparison, or around the brightest peaks when there are none.
 
     Boxes are as high as they are wide on the sky and lie on the grid as far as it goes.
+
+    Parameters
+    ----------
+    comparison : casa_sara.analysis.comparison.Comparison
+        The products and what was measured.
+    most : int
+        Largest number of boxes.
+
+    Returns
+    -------
+    list of Zoom
     """
     named = [(name, mask) for name, mask in comparison.regions.items() if np.any(mask)][:most]
     if named:
@@ -60,7 +94,7 @@ def _around_peaks(comparison, most) -> list[Zoom]:
     highest = maximum_filter(softened, [2 * max(int(np.ceil(side / width)), 2) + 1 for width in cell])
     peaks = np.argwhere((softened == highest) & (softened > FAINTEST * softened.max()))
     peaks = sorted(peaks, key=lambda peak: -softened[tuple(peak)])[:most]
-    return [Zoom(f"peak {number}", _box(*peak, side, cell, shape)) for number, peak in enumerate(peaks, 1)]
+    return [Zoom(f"peak {number}", _box(peak[0], peak[1], side, cell, shape)) for number, peak in enumerate(peaks, 1)]
 
 
 def _box(x, y, side, cell, shape) -> tuple[int, int, int, int]:

@@ -49,7 +49,9 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     Parameters
     ----------
     request : Comparing
+        What to compare.
     selection : Selection, optional
+        The MeasurementSets and the data selected in them.
     single : bool
         One product will do, for the report of one run.
 

@@ -61,8 +61,11 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
     one : casa_sara.casa.images.image_sets.ImageSet
         Of a run of tsara.
     injection : Injection
+        Sources to inject.
     selection : Selection
+        The MeasurementSets and the data selected in them.
     nthreads : int
+        Number of threads.
 
     Returns
     -------

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from casa_sara.data.visibilities import BlockInfo
-from casa_sara.parallel.serial import SERIAL
+from casa_sara.data.visibilities import BlockInfo, Visibilities
+from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["snapshot_blocks"]
 
@@ -18,7 +18,8 @@ SMALLEST_SNAPSHOT = 500
 SESSION_GAP_SECONDS = 12 * 3600.0
 
 
-def snapshot_blocks(visibilities, blocks=0, group=None, comm=SERIAL):
+def snapshot_blocks(visibilities: Visibilities, blocks: int = 0, group: np.ndarray | None = None,
+                    comm: Serial = SERIAL) -> tuple[np.ndarray, list[BlockInfo]]:
     """Split the samples into snapshots: spans over which errors may be taken as constant.
 
     Each block gets an ℓ2 bound of its own. The automatic rule (`blocks` = 0):
@@ -36,6 +37,7 @@ def snapshot_blocks(visibilities, blocks=0, group=None, comm=SERIAL):
     Parameters
     ----------
     visibilities : Visibilities
+        The samples to divide.
     blocks : int
         0 for the automatic rule, or the number of blocks.
     group : int (M,), optional
@@ -88,7 +90,7 @@ def _integrations(visibilities, comm):
     lists = [np.concatenate(every) for every in zip(*comm.allgather((*own, samples)))]
     whole, of_own = _distinct(lists[:-1])
     begin = sum(comm.allgather(own[0].size)[: comm.rank])
-    table = _Integrations(*whole, samples=np.bincount(of_own, lists[-1], whole[0].size).astype(np.int64))
+    table = _Integrations(*[*whole, np.bincount(of_own, lists[-1], whole[0].size).astype(np.int64)])
     return table, of_own[begin : begin + own[0].size][of_row]
 
 

@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from casa_sara.data.visibilities import RowTable
+from casa_sara.data.visibilities import RowTable, Visibilities
+from casa_sara.parallel.serial import Serial
 
 __all__ = ["Layout", "by_baseline", "series_with"]
 
@@ -25,27 +26,59 @@ class Layout:
     comm : casa_sara.parallel.serial.Serial or MPI
     """
 
-    def __init__(self, offsets, comm):
+    def __init__(self, offsets: np.ndarray, comm: Serial) -> None:
         self._offsets, self._comm = np.asarray(offsets), comm
         self._counts = np.array(comm.allgather(np.diff(self._offsets)))  # (ranks, d)
         before, self.totals = self._counts[: comm.rank].sum(axis=0), self._counts.sum(axis=0)
         self.offsets = np.concatenate([[0], np.cumsum(self.totals)])  # of all samples
         self._starts = self.offsets[:-1] + before
 
-    def numbers(self, index):
-        """Return the numbers, among all samples, of the samples `index` of this rank."""
+    def numbers(self, index: np.ndarray) -> np.ndarray:
+        """Return the numbers, among all samples, of the samples `index` of this rank.
+
+        Parameters
+        ----------
+        index : int (n,)
+            Positions in this rank's samples.
+
+        Returns
+        -------
+        int (n,)
+        """
         block = np.searchsorted(self._offsets, index, "right") - 1
         return self._starts[block] + index - self._offsets[block]
 
-    def here(self, numbers):
-        """Return which of this rank's samples are among those of these numbers."""
+    def here(self, numbers: np.ndarray) -> np.ndarray:
+        """Return which of this rank's samples are among those of these numbers.
+
+        Parameters
+        ----------
+        numbers : int (n,)
+            Numbers among all samples.
+
+        Returns
+        -------
+        int (k,)
+            Positions in this rank's samples.
+        """
         block = np.searchsorted(self.offsets, numbers, "right") - 1
         within = numbers - self._starts[block]
         held = (within >= 0) & (within < np.diff(self._offsets)[block])
         return (self._offsets[block] + within)[held]
 
-    def gather(self, array):
-        """Return the samples of all ranks along the last axis of an array, on rank 0; None on the others."""
+    def gather(self, array: np.ndarray) -> np.ndarray | None:
+        """Return the samples of all ranks along the last axis of an array, on rank 0; None on the others.
+
+        Parameters
+        ----------
+        array : (…, M)
+            This rank's samples, along the last axis.
+
+        Returns
+        -------
+        (…, M) or None
+            On rank 0 the samples of all ranks as one rank alone has them.
+        """
         if self._comm.size == 1:
             return array
         parts = self._comm.gather(array)
@@ -58,11 +91,21 @@ class Layout:
             parts[rank] = None
         return whole
 
-    def scatter(self, whole):
-        """Return this rank's samples of an array (M,) of rank 0; the others give None."""
+    def scatter(self, whole: np.ndarray | None) -> np.ndarray | None:
+        """Return this rank's samples of an array (M,) of rank 0; the others give None.
+
+        Parameters
+        ----------
+        whole : (M,) or None
+            The samples of all ranks on rank 0, None on the others.
+
+        Returns
+        -------
+        (M,)
+        """
         if self._comm.size == 1:
             return whole
-        return self._comm.scatter(None if self._comm.rank else [
+        return self._comm.scatter(None if whole is None else [
             np.concatenate([whole[there] for there, _ in self._slices(rank)]) for rank in range(self._comm.size)])
 
     def _slices(self, rank):
@@ -73,10 +116,24 @@ class Layout:
             yield slice(start, start + count), slice(end - count, end)
 
 
-def by_baseline(visibilities, offsets, comm):
+def by_baseline(visibilities: Visibilities, offsets: np.ndarray, comm: Serial) -> tuple[Visibilities, np.ndarray]:
     """Return the samples that this rank is given so that it has all of each of its baselines, and their offsets.
 
     Of the samples only `vis`, `weight`, `row` and `chan` come along.
+
+    Parameters
+    ----------
+    visibilities : Visibilities
+        This rank's samples, in the order of their blocks.
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
+
+    Returns
+    -------
+    visibilities : Visibilities
+    offsets : int (d + 1,)
     """
     if comm.size == 1:
         return visibilities, offsets
@@ -91,7 +148,8 @@ def by_baseline(visibilities, offsets, comm):
     return _joined(parts).take(np.argsort(block, kind="stable")), offsets
 
 
-def series_with(data, residual, suspect, comm):
+def series_with(data: Visibilities, residual: np.ndarray, suspect: np.ndarray,
+                comm: Serial) -> tuple[Visibilities, np.ndarray, np.ndarray]:
     """Return (data, residual, suspect) that hold the series of all samples `suspect` from the first to the last.
 
     A series is what one baseline and channel have seen.  One rank alone has them all; of several each is given those of
@@ -100,7 +158,9 @@ def series_with(data, residual, suspect, comm):
     Parameters
     ----------
     data : Visibilities
+        This rank's samples.
     residual : complex (M,)
+        Of these samples.
     suspect : int (n,)
         Numbers of samples.
     comm : casa_sara.parallel.serial.Serial or MPI

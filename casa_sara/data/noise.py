@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from casa_sara.data.distribution import by_baseline
+from casa_sara.data.visibilities import RowTable, Visibilities
 from casa_sara.data.weight_levels import levels
-from casa_sara.parallel.serial import SERIAL
+from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["MEDIAN_TO_SIGMA", "noise_from_differences", "series_of_rows"]
 
@@ -14,7 +15,7 @@ FEWEST_DIFFERENCES = 20
 MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
 
 
-def noise_from_differences(visibilities, offsets, comm=SERIAL):
+def noise_from_differences(visibilities: Visibilities, offsets: np.ndarray, comm: Serial = SERIAL) -> np.ndarray:
     """Measure the noise of each block relative to the MS weights.
 
     Along one baseline and channel the sky changes slowly and the noise does not, so
@@ -48,8 +49,18 @@ def noise_from_differences(visibilities, offsets, comm=SERIAL):
     return np.array([_block_noise(visibilities, slice(*ends), series, comm) for ends in zip(offsets[:-1], offsets[1:])])
 
 
-def series_of_rows(rows):
-    """Number the distinct (MeasurementSet, observation, field, spw, baseline) and return each row's."""
+def series_of_rows(rows: RowTable) -> np.ndarray:
+    """Number the distinct (MeasurementSet, observation, field, spw, baseline) and return each row's.
+
+    Parameters
+    ----------
+    rows : RowTable
+        Metadata of the rows.
+
+    Returns
+    -------
+    int (R,)
+    """
     key = np.zeros(rows.time.size, dtype=np.int64)
     for column in (rows.ms, rows.observation, rows.field, rows.spw, rows.antenna1, rows.antenna2):
         key = np.unique(key * (int(column.max(initial=0)) + 1) + column, return_inverse=True)[1]
@@ -71,7 +82,7 @@ def _block_noise(visibilities, block, series, comm):
     next_one = same & (step < 1.5 * comm.median(step[same]))
     level, count = levels(visibilities.weight[block], comm)
     level = level[order]
-    found = []
+    found: list[tuple[int, float]] = []  # samples and noise
     for number in reversed(range(count)):  # where differences are too few, the noise is that of the next heavier level
         here = level == number
         noise = _noise_of_pairs(vis, variance, next_one & here[:-1] & here[1:], comm)

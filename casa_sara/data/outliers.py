@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from casa_sara.data.distribution import series_with
 from casa_sara.data.noise import MEDIAN_TO_SIGMA, series_of_rows
+from casa_sara.data.visibilities import Visibilities
 from casa_sara.data.weight_levels import APART, levels
-from casa_sara.parallel.serial import SERIAL
+from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["WildSamples", "find_wild"]
 
@@ -36,8 +38,18 @@ class WildSamples:
     amplitude_jy: np.ndarray
     predicted_jy: np.ndarray
 
-    def named(self, data):
-        """Return a list of dicts that name each sample: ms, row, channel, antennas, time (MJD s), amplitudes (Jy)."""
+    def named(self, data: Visibilities) -> list[dict[str, Any]]:
+        """Return a list of dicts that name each sample: ms, row, channel, antennas, time (MJD s), amplitudes (Jy).
+
+        Parameters
+        ----------
+        data : Visibilities
+            The samples that were searched.
+
+        Returns
+        -------
+        list of dict
+        """
         rows, row = data.rows, data.row[self.index]
         return [
             dict(ms=data.ms_names[rows.ms[r]] if data.ms_names else "", row=int(rows.row[r]), channel=int(channel),
@@ -47,16 +59,16 @@ class WildSamples:
         ]
 
 
-def find_wild(data, offsets, residual, flux_jy, comm=SERIAL):
+def find_wild(data: Visibilities, offsets: np.ndarray, residual: np.ndarray, flux_jy: float,
+              comm: Serial = SERIAL) -> WildSamples:
     """Find samples that a first image cannot have left for any reason but their own.
 
     A sample is wild when its residual exceeds 20 times the scale of the samples of like weight in its block (1.4826 ×
     the median of the whitened real and imaginary parts) and what the image predicts for it, and when either
 
     - its amplitude exceeds 1.5 times the flux of the image, as no visibility of a positive sky does, or
-    - it stands alone: the residuals of the same baseline and channel before and after it (median of up to four) differ
-    from
-      it by more than half of it, as what the image lacks, or a calibration error, would not.
+    - it stands alone: the residuals of the same baseline and channel before and after it (median of up to four)
+      differ from it by more than half of it, as what the image lacks, or a calibration error, would not.
 
     Of these only the ones within a factor 5 of the largest residual are named: they may have spoiled the image, and
     made the others look wild, so a next image must tell.  Nothing is wild when more than 1 % of the samples would be.
@@ -91,7 +103,7 @@ def find_wild(data, offsets, residual, flux_jy, comm=SERIAL):
     impossible = np.abs(data.vis[suspect]) > IMPOSSIBLE * flux_jy
     wild = suspect[impossible | _alone(*series_with(data, residual, suspect, comm))]
     counted = data.weight >= comm.largest(data.weight[wild].max(initial=0)) / APART
-    if comm.total(wild.size) > MOST * comm.total(np.count_nonzero(counted)):
+    if comm.total(wild.size) > MOST * comm.total(int(np.count_nonzero(counted))):
         wild = wild[:0]
     wild = wild[size[wild] >= COMPARABLE * comm.largest(size[wild].max(initial=0))]
     return WildSamples(wild, np.abs(data.vis[wild]), predicted[wild])

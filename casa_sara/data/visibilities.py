@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -96,14 +97,35 @@ class Visibilities:
         """Number of samples M."""
         return self.vis.size
 
-    def take(self, index) -> Visibilities:
-        """Return the samples numbered `index`, in that order; `rows` stays whole."""
-        per_sample = ("vis", "weight", "imaging_weight", "uvw", "row", "chan")
-        per_sample += ("freq_hz",) if self.freq_hz is not None else ()
-        return replace(self, **{name: np.take(getattr(self, name), index, axis=-1) for name in per_sample})
+    def take(self, index: np.ndarray) -> Visibilities:
+        """Return the samples numbered `index`, in that order; `rows` stays whole.
 
-    def part(self, index) -> Visibilities:
-        """Return the samples numbered `index`, in that order, with `rows` of their own."""
+        Parameters
+        ----------
+        index : int (n,)
+            Numbers of samples.
+
+        Returns
+        -------
+        Visibilities
+        """
+        per_sample = ["vis", "weight", "imaging_weight", "uvw", "row", "chan"]
+        per_sample += ["freq_hz"] if self.freq_hz is not None else []
+        taken: dict[str, Any] = {name: np.take(getattr(self, name), index, axis=-1) for name in per_sample}
+        return replace(self, **taken)
+
+    def part(self, index: np.ndarray) -> Visibilities:
+        """Return the samples numbered `index`, in that order, with `rows` of their own.
+
+        Parameters
+        ----------
+        index : int (n,)
+            Numbers of samples.
+
+        Returns
+        -------
+        Visibilities
+        """
         chosen = self.take(index)
         used, row = np.unique(chosen.row, return_inverse=True)
         chosen.row = row.astype(np.int32)
@@ -145,17 +167,29 @@ class BlockInfo:
         return f"{self.ms_name} observation {observations} scan {scans}, {first} to {last}, {self.samples} samples"
 
 
-def clock(mjd_seconds):
-    """Spell a time in UTC."""
+def clock(mjd_seconds: float) -> str:
+    """Spell a time in UTC.
+
+    Parameters
+    ----------
+    mjd_seconds : float
+        Time in MJD seconds, UTC.
+
+    Returns
+    -------
+    str
+    """
     return str(np.datetime64("1858-11-17T00:00:00") + np.timedelta64(round(mjd_seconds), "s"))
 
 
-def sort_into_blocks(visibilities, block_of_sample, blocks=0):
+def sort_into_blocks(visibilities: Visibilities, block_of_sample: np.ndarray,
+                     blocks: int = 0) -> tuple[Visibilities, np.ndarray]:
     """Return the same samples ordered so that each block is one slice.
 
     Parameters
     ----------
     visibilities : Visibilities
+        The samples to sort.
     block_of_sample : int (M,)
         Numbers 0 … d−1.
     blocks : int

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from casa_sara.parallel.serial import SERIAL
+from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["APART", "gaps", "levels"]
 
@@ -19,7 +19,7 @@ FEW = 0.01  # of the weights, which make no level
 _TENTHS = 320  # of a decade, from 1 to the lightest, and to the heaviest
 
 
-def gaps(weight, factor, comm=SERIAL):
+def gaps(weight: np.ndarray, factor: float, comm: Serial = SERIAL) -> tuple[np.ndarray, np.ndarray]:
     """Find where no weight is within a factor.
 
     Parameters
@@ -47,10 +47,22 @@ def gaps(weight, factor, comm=SERIAL):
     return middle, 1 - np.cumsum(counts)[held[below]] / counts.sum()
 
 
-def levels(weight, comm=SERIAL):
+def levels(weight: np.ndarray, comm: Serial = SERIAL) -> tuple[np.ndarray, int]:
     """Return the level of each weight, int (M,), from the lightest on, and how many there are.
 
     Between levels there is a factor of 100 without weights; one that holds 1 % of them at most goes with the next.
+
+    Parameters
+    ----------
+    weight : real (M,)
+        From 1e-31 to 1e31.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the weights are spread.
+
+    Returns
+    -------
+    level : int (M,)
+    count : int
     """
     middle, share = gaps(weight, APART, comm)
     middle = middle[(share > FEW) & (share < 1 - FEW)]

@@ -6,10 +6,12 @@ import multiprocessing
 import os
 import sys
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from casatools import image
@@ -81,7 +83,7 @@ def run_tcleans(case: Case) -> list[Product]:
     return [_product(name, *result) for name, result in zip(TCLEAN_WEIGHTINGS, made)]
 
 
-def write_comparison(case: Case, **more) -> tuple[str, Path]:
+def write_comparison(case: Case, **more: Any) -> tuple[str, Path]:
     """Compare the three products of a case as the task saracompare does; return its tables as text, and the report.
 
     `more` is the rest of `casa_sara.options.Comparing`.
@@ -120,7 +122,7 @@ def _product(name, root, iterations, wall_s, cpu_s) -> Product:
     return Product(name, model, restored, residual, beam, iterations, wall_s, cpu_s)
 
 
-def read_image(name) -> tuple[np.ndarray, tuple[float, float, float] | None]:
+def read_image(name: str | Path) -> tuple[np.ndarray, tuple[float, float, float] | None]:
     """Return a CASA image's pixels, float64 (nx, ny), and its beam (arcsec, arcsec, degrees) if it has one."""
     ia = image()
     ia.open(str(name))
@@ -135,7 +137,7 @@ def read_image(name) -> tuple[np.ndarray, tuple[float, float, float] | None]:
 
 
 @contextmanager
-def quiet(log):
+def quiet(log: str | Path) -> Iterator[None]:
     """Send what CASA writes to the terminal, from C++ too, to the end of a file."""
     sys.stdout.flush()
     sys.stderr.flush()

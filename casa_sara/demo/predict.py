@@ -21,6 +21,7 @@ def predict(sky: Sky, uvw: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     sky : Sky
+        The model of the sky.
     uvw : float64 (3, M)
         Baselines in wavelengths.
 

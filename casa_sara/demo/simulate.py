@@ -117,6 +117,7 @@ def simulate_observation(
     out_dir : str or Path
         Existing folder; `<config>.ms` must not exist in it.
     sky : Sky
+        The model of the sky.
     configs : sequence of str
         Names of the configurations, filled (in lower case) into `observation.antenna_file`.
     noise_db : float
@@ -127,6 +128,7 @@ def simulate_observation(
     seed : int
         The same seed gives the same gains whatever the noise is.
     observation : Observation
+        Source, frequency and times of the observation.
 
     Returns
     -------

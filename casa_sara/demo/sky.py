@@ -72,7 +72,8 @@ class Sky:
         return truth
 
 
-def cyg_a_like(shape=(512, 256), cell_arcsec=0.06, oversampling=2, seed=1405) -> Sky:
+def cyg_a_like(shape: tuple[int, int] = (512, 256), cell_arcsec: float = 0.06, oversampling: int = 2,
+               seed: int = 1405) -> Sky:
     """Build the demo's radio galaxy.
 
     Two lobes of filaments with bright rims, two hotspots in each, a jet with knots, a core of

@@ -243,7 +243,9 @@ def split(data, blocks, comm=SERIAL):
     Parameters
     ----------
     data : Visibilities
+        The samples.
     blocks : int or tuple of str
+        As of :class:`casa_sara.options.Output`.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
 

@@ -47,6 +47,7 @@ def thermal_noise(data, weights, noise, offsets, comm=SERIAL):
     data : Visibilities
         In the order of their blocks.
     weights : real (M,)
+        Imaging weights.
     noise : float (d,)
         Of each block relative to the MS weights; 1 is assumed where it is NaN.
     offsets : int (d + 1,)
@@ -69,7 +70,9 @@ def left_outside(residual, support, sigma):
     Parameters
     ----------
     residual : real (nx, ny), Jy/beam
+        The residual image, Jy/beam.
     support : bool (nx, ny)
+        Pixels that may be non-zero.
     sigma : float
         Its thermal noise, Jy/beam.
 
@@ -99,9 +102,11 @@ def suspects(blocks, measured, l2_bounds):
     Parameters
     ----------
     blocks : list of d BlockInfo
+        The blocks.
     measured : float (d,)
         NaN where unknown.
     l2_bounds : float (d,)
+        Their bounds, whitened.
 
     Returns
     -------
@@ -146,7 +151,9 @@ def beyond_baselines(model, cell_rad, shortest):
     Parameters
     ----------
     model : real (nx, ny), Jy/pixel
+        Jy/pixel.
     cell_rad : (float, float)
+        Pixel size in radians.
     shortest : float
         Shortest projected baseline in wavelengths.
 

@@ -93,6 +93,7 @@ def dry_run(selection, grid, options, blocks, limits):
     blocks : int or tuple of str
         As of :class:`casa_sara.options.Output`.
     limits : casa_sara.options.Limits
+        Largest memory.
 
     Returns
     -------

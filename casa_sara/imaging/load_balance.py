@@ -44,9 +44,13 @@ def assign_ranks(comm, volume, grid, options, fits=lambda ranks: True):
     Parameters
     ----------
     comm : casa_sara.parallel.serial.Serial or MPI
+        The ranks.
     volume : casa_sara.casa.ms.data_volume.DataVolume
+        How many data there are.
     grid : casa_sara.options.ImageGrid
+        Size, pixels, direction and gridder of the image.
     options : casa_sara.options.SolverOptions
+        Task parameters of the method.
     fits : callable
         Tells whether the ranks have the memory for a division of the work; the same on every rank.
 

@@ -274,6 +274,7 @@ def forecast(workload, resident, available, maxmem_gb=0.0):
     Parameters
     ----------
     workload : Workload
+        What the memory depends on.
     resident, available : int
         Bytes held by the process, and those that it can take in addition.
     maxmem_gb : float

@@ -43,10 +43,13 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     Parameters
     ----------
     data : Visibilities
+        The samples.
     model : real (nx, ny)
         Jy/pixel.
     grid : ImageGrid
+        Size, pixels, direction and gridder of the image.
     weighting : Weighting
+        Imaging weights that were asked for.
     options : SolverOptions
         Whose number of threads is used.
     plane : ImagePlane

@@ -67,10 +67,13 @@ def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid,
     Parameters
     ----------
     data : Visibilities
+        The samples.
     selection : Selection or None
         That gave the data; None where they are but a part of it.
     grid : ImageGrid
+        Size, pixels, direction and gridder of the image.
     options : SolverOptions
+        Task parameters of the method.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
     """
@@ -90,7 +93,9 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     samples : Samples
         With the sampling density (:func:`density_of`) and the noise.
     grid : ImageGrid
+        Size, pixels, direction and gridder of the image.
     options : SolverOptions
+        Task parameters of the method.
     startmodel : float32 (nx, ny), optional
         First model, Jy/pixel.
     watch : Watch, optional
@@ -201,10 +206,13 @@ def without_wild(data: Visibilities, blocks: list[BlockInfo], offsets: np.ndarra
     Parameters
     ----------
     data : Visibilities
+        The samples.
     blocks : list of d BlockInfo
+        The blocks.
     offsets : int (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1].
     reconstruction : Reconstruction
+        The solution, which names the samples that it has left out.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
 
@@ -237,6 +245,7 @@ def list_islands(record: SolverRecord, plane: ImagePlane, cell_rad: tuple[float,
     record : SolverRecord
         Its islands are given `right_ascension` and `declination` (text, in the frame of the image) and `fwhm_arcsec`.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
     cell_rad : (float, float)
         Pixel size.
     significance : float

@@ -70,8 +70,11 @@ def measure(data, offsets, grid, options, reading):
     data : Visibilities
         In the order of their blocks.
     offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1].
     grid : ImageGrid
+        Size, pixels, direction and gridder of the image.
     options : SolverOptions
+        Task parameters of the method.
     reading : float
         Seconds that it took to read the data.
 

@@ -27,7 +27,8 @@ class Workers:
         With part = (p, n) these are workers p·count, p·count + 1, … of n·count: the others are in other processes.
         """
         first, count = part[0] * self.count, part[1] * self.count
-        others = [self._pool.submit(kernel, *args, first + worker, count) for worker in range(1, self.count)]
+        others = [self._pool.submit(kernel, *args, first + worker, count)
+                  for worker in range(1, self.count)] if self._pool else []
         kernel(*args, first, count)
         for other in others:
             other.result()

@@ -150,6 +150,7 @@ def separable(axis: AxisDecimation, size: int, cells: np.ndarray, factors: np.nd
     Parameters
     ----------
     axis : AxisDecimation
+        How the axis is decimated.
     size : int
         Pixels.
     cells : int64 (count,)
@@ -157,6 +158,7 @@ def separable(axis: AxisDecimation, size: int, cells: np.ndarray, factors: np.nd
     factors : float64 (count,)
         What each is multiplied with, beside the modulation.
     dtype : complex64 or complex128
+        Precision of the gains.
 
     Returns
     -------
@@ -168,8 +170,20 @@ def separable(axis: AxisDecimation, size: int, cells: np.ndarray, factors: np.nd
     return Separable(np.pad(axis.taps, margin).astype(dtype), margin, axis.factor, first, cells, gains.astype(dtype))
 
 
-def scratch_shape(columns, workers):
-    """Shape of the real work space of `decimate` and `expand`."""
+def scratch_shape(columns: Separable, workers: int) -> tuple[int, ...]:
+    """Shape of the real work space of `decimate` and `expand`.
+
+    Parameters
+    ----------
+    columns : Separable
+        Taps, cells and gains along the second axis.
+    workers : int
+        Number of threads that share the work.
+
+    Returns
+    -------
+    tuple of int
+    """
     shifts = -(-(columns.taps.size - 2 * columns.margin) // columns.factor)
     vectors = -(-(columns.cells.size + shifts) // len(WIDE))
     return workers, columns.factor + 2, shifts + vectors * len(WIDE)
@@ -185,6 +199,25 @@ def decimate(image, rows, columns, grid, lines, scratch, worker, workers):
 
     `lines` real (rows.cells.size, ny) receives the image decimated along its first axis only, by
     real taps.  `scratch` has the shape `scratch_shape`.
+
+    Parameters
+    ----------
+    image : real (nx, ny)
+        The image.
+    rows : Separable
+        Taps, cells and gains along the first axis.
+    columns : Separable
+        Taps, cells and gains along the second axis.
+    grid : complex (NX, NY)
+        The samples of the image on the grid of the transform.
+    lines : real (rows.cells.size, ny)
+        The image decimated along its first axis only.
+    scratch : real
+        Work space of the shape `scratch_shape`.
+    worker : int
+        Number of this thread among them.
+    workers : int
+        Number of threads that share the work.
     """
     n_taps = rows.taps.size - 2 * rows.margin
     begin, end = rows.cells.size * worker // workers, rows.cells.size * (worker + 1) // workers
@@ -205,7 +238,25 @@ def decimate(image, rows, columns, grid, lines, scratch, worker, workers):
 
 @_jit
 def expand(grid, rows, columns, lines, scratch, worker, workers):
-    """Transpose of the second half of `decimate`: samples in the grid to `lines`, Re of the conjugate."""
+    """Transpose of the second half of `decimate`: samples in the grid to `lines`, Re of the conjugate.
+
+    Parameters
+    ----------
+    grid : complex (NX, NY)
+        The samples of the image on the grid of the transform.
+    rows : Separable
+        Taps, cells and gains along the first axis.
+    columns : Separable
+        Taps, cells and gains along the second axis.
+    lines : real (rows.cells.size, ny)
+        The image decimated along its first axis only.
+    scratch : real
+        Work space of the shape `scratch_shape`.
+    worker : int
+        Number of this thread among them.
+    workers : int
+        Number of threads that share the work.
+    """
     phases, sums = scratch[worker, :-2], scratch[worker, -2:]
     shifts = -(-(columns.taps.size - 2 * columns.margin) // columns.factor)
     for i in range(rows.cells.size * worker // workers, rows.cells.size * (worker + 1) // workers):
@@ -219,7 +270,21 @@ def expand(grid, rows, columns, lines, scratch, worker, workers):
 
 @_jit
 def expand_rows(lines, rows, image, worker, workers):
-    """Transpose of the first half of `decimate`: lines to a real image (nx, ny)."""
+    """Transpose of the first half of `decimate`: lines to a real image (nx, ny).
+
+    Parameters
+    ----------
+    lines : real (rows.cells.size, ny)
+        The image decimated along its first axis only.
+    rows : Separable
+        Taps, cells and gains along the first axis.
+    image : real (nx, ny)
+        The image.
+    worker : int
+        Number of this thread among them.
+    workers : int
+        Number of threads that share the work.
+    """
     n_taps = rows.taps.size - 2 * rows.margin
     begin, end = image.shape[0] * worker // workers, image.shape[0] * (worker + 1) // workers
     for group in range(begin, end, GROUP):

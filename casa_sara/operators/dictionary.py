@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -77,7 +77,8 @@ class SaraDictionary:
                  dtype: npt.DTypeLike = np.float32, nthreads: int = 1, n_bases: int | None = None) -> None:
         self.shape = tuple(int(n) for n in shape)
         self.wavelets = tuple(wavelets)
-        self.levels, self.dtype = int(levels), np.dtype(dtype)
+        self.levels = int(levels)
+        self.dtype: np.dtype[Any] = np.dtype(dtype)
         self.n_bases = len(self.wavelets) if n_bases is None else int(n_bases)
         self._validate()
         padded = _padded(self.shape, self.levels)
@@ -144,6 +145,7 @@ class SaraDictionary:
         Parameters
         ----------
         image : real (nx, ny)
+            The image x.
         out : real coef_shape, optional
             Receives the result.
 
@@ -161,6 +163,7 @@ class SaraDictionary:
         Parameters
         ----------
         coefs : real coef_shape
+            The coefficients.
         out : real (nx, ny), optional
             Receives the result.
 
@@ -201,6 +204,11 @@ class SaraDictionary:
         relaxation : float
             ρ.
 
+        Returns
+        -------
+        real (nx, ny)
+            Ψ dual.
+
         Raises
         ------
         ValueError
@@ -229,6 +237,7 @@ class SaraDictionary:
         Parameters
         ----------
         image : real (nx, ny)
+            The image whose coefficients set the weights.
         alpha, scale : float or float (number of bands,)
             α > 0, in the unit of the coefficients, and s.
         out : real coef_shape
@@ -254,7 +263,9 @@ class SaraDictionary:
         coefs : real coef_shape
             Changed in place.
         pixels : bool (nx, ny)
+            Pixels whose coefficients are meant.
         factor : float
+            Factor on their weights.
         """
         coefs = self._checked(coefs, "coefs", self.coef_shape)
         plane = np.zeros(self.coef_shape[1:], bool)
@@ -319,7 +330,9 @@ def coefficient_bytes(shape: tuple[int, int], n_bases: int, levels: int,
     shape : (int, int)
         Pixels of the image.
     n_bases, levels : int
+        Number of bases.
     dtype : float32 or float64
+        Precision of the coefficients.
 
     Returns
     -------

@@ -42,6 +42,7 @@ def kernel(t: np.ndarray, beta: float | np.ndarray) -> np.ndarray:
     Parameters
     ----------
     t : real, any shape
+        Distance from the centre in cells.
     beta : float
         Shape β.
 

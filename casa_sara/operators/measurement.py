@@ -122,6 +122,7 @@ class MeasurementOperator:
         Parameters
         ----------
         image : real (nx, ny)
+            The image x.
         out : complex (M,), optional
             Receives the result.
 
@@ -145,6 +146,7 @@ class MeasurementOperator:
         Parameters
         ----------
         vis : complex (M,)
+            The visibilities.
         out : real (nx, ny), optional
             Receives the result.
 
@@ -169,11 +171,35 @@ class NoVisibilities:
         self.complex_dtype, self.workers = np.result_type(self.dtype, np.complex64), Workers(nthreads)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return no visibilities."""
+        """Return no visibilities.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            The image, which is not looked at.
+        out : complex (0,), optional
+            Returned where given.
+
+        Returns
+        -------
+        complex (0,)
+        """
         return np.empty(0, self.complex_dtype) if out is None else out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return zeros (nx, ny), in `out` where given."""
+        """Return zeros (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        vis : complex (0,)
+            No visibilities.
+        out : real (nx, ny), optional
+            Receives the zeros.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         out = np.empty(self.shape, self.dtype) if out is None else out
         out.fill(0)
         return out
@@ -226,11 +252,11 @@ def share_of(uv: np.ndarray, *arguments: Any, comm: Serial = SERIAL,
     reach = [comm.largest(float(np.abs(axis).max(initial=0))) for axis in uv]
     whole = comm.total(uv.shape[1]), reach
     if uv.shape[1]:
-        return MeasurementOperator(uv, *arguments, whole=whole, **options)
+        return MeasurementOperator(uv, *arguments, **(options | dict(whole=whole)))
     return NoVisibilities(arguments[1], nthreads=options.get("nthreads", 1))
 
 
-def check_cell(uv: np.ndarray, cell_rad: float | tuple[float, float] | np.ndarray) -> None:
+def check_cell(uv: np.ndarray, cell_rad: float | Sequence[float] | np.ndarray) -> None:
     """Raise ValueError unless pixels of `cell_rad` (one number, or one per axis) sample the fringes of uv (2, M).
 
     Parameters

@@ -57,7 +57,19 @@ class ModulatedOperator:
         self._vis = np.empty(self.size, self.complex_dtype)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
+        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            The image.
+        out : array, optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         image = np.ascontiguousarray(image, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         if image.shape != self.shape or out.shape != (self.size,) or out.dtype != self.complex_dtype:
@@ -72,7 +84,19 @@ class ModulatedOperator:
         return out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
+        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,).
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            The visibilities.
+        out : array, optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         vis = np.ascontiguousarray(vis, self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
         if vis.shape != (self.size,) or out.shape != self.shape or out.dtype != self.dtype:
@@ -119,7 +143,9 @@ def bessel_factors(argument: np.ndarray, count: int, modified: bool = False,
     argument : float64 (M,)
         c, at most about 20: the power series cancels beyond.
     count : int
+        Number of terms.
     modified : bool
+        Of exp(c s) instead of exp(i c s).
     dtype : float32 or float64
         Of the result.
 

@@ -219,6 +219,7 @@ def memory_size(n_points: int, starts: Sequence[int], counts: Sequence[int], eps
     eps : float
         Accuracy.
     dtype : float32 or float64
+        Precision of the image.
 
     Returns
     -------

@@ -48,6 +48,10 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - six have a
         As of :class:`casa_sara.operators.measurement.MeasurementOperator`, whose interface the result has.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the visibilities are spread; the result is of this rank's.
+
+    Returns
+    -------
+    MeasurementOperator, ModulatedOperator, WGridder or NoVisibilities
     """
     def of_place(row_scale, eps):
         return _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm)
@@ -91,12 +95,15 @@ def further_bytes(samples: int, grid: Any, max_w: float = 0.0, band: float = 0.0
     Parameters
     ----------
     samples : int
+        Number of visibilities.
     grid : casa_sara.options.ImageGrid
+        `shape`, `cell_rad` and `gridder` decide.
     max_w : float
         Largest |w| in wavelengths.
     band : float
         Largest |ln(ν/ν0)|; 0 unless there is an image of the spectral index.
     eps : float
+        Accuracy of the operator.
 
     Returns
     -------

@@ -163,7 +163,19 @@ class WGridder:
         self._vis = np.empty((self.size, 1), np.result_type(precise, np.complex64))
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
+        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            The image.
+        out : array, optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         if np.shape(image) != self.shape:
             raise ValueError(f"image must be of shape {self.shape}")
         out = np.empty(self.size, self.complex_dtype) if out is None else out
@@ -174,7 +186,19 @@ class WGridder:
         return out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
+        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,).
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            The visibilities.
+        out : array, optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         if np.shape(vis) != (self.size,):
             raise ValueError(f"vis must be of shape ({self.size},)")
         out = np.empty(self.shape, self.dtype) if out is None else out

@@ -7,11 +7,14 @@ import os
 import pickle
 import shutil
 import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from casa_sara.parallel.serial import Serial
+from casa_sara.parallel.serial import Number, Serial, T
 
 __all__ = ["LAUNCHED", "MPI", "world"]
 
@@ -45,12 +48,12 @@ class MPI(Serial):
         self.part, self._windows = (0, 1), []
         self._sent, self._raised, self._stuck = [], None, False
 
-    def allreduce(self, array):
+    def allreduce(self, array: np.ndarray) -> np.ndarray:
         self._meet()
         self._comm.Allreduce(self._mpi.IN_PLACE, array)
         return array
 
-    def iallreduce(self, array):
+    def iallreduce(self, array: np.ndarray) -> Callable[[], np.ndarray]:
         request = self._comm.Iallreduce(self._mpi.IN_PLACE, array)
 
         def wait():
@@ -58,10 +61,10 @@ class MPI(Serial):
             return array
         return wait
 
-    def total(self, number):
+    def total(self, number: Number) -> Number:
         return self._reduced(number, self._mpi.SUM)
 
-    def largest(self, number):
+    def largest(self, number: Number) -> Number:
         return self._reduced(number, self._mpi.MAX)
 
     def _reduced(self, number, operation):
@@ -69,17 +72,17 @@ class MPI(Serial):
         self._wait(self._comm.Iallreduce(self._mpi.IN_PLACE, value, operation))
         return value[0].item()
 
-    def bcast_numbers(self, values):
+    def bcast_numbers(self, values: list[float]) -> list[float]:
         values = np.array(values, float)
         self._wait(self._comm.Ibcast(values))
         return values.tolist()
 
-    def mean(self, values, dtype=None):
+    def mean(self, values: np.ndarray, dtype: npt.DTypeLike | None = None) -> Any:
         dtype = values.dtype if dtype is None else np.dtype(dtype)
         total, count = self.allreduce(np.array([values.sum(dtype=float), values.size]))
         return dtype.type(total / count)
 
-    def median(self, values):
+    def median(self, values: np.ndarray) -> Any:
         if self.total(values.size) <= FEW:
             return np.median(np.concatenate([part.ravel() for part in self.allgather(values)]))
         values = np.sort(values, axis=None)
@@ -99,54 +102,57 @@ class MPI(Serial):
                 low = between + 1
         return low
 
-    def norms(self, norms):
+    def norms(self, norms: np.ndarray) -> np.ndarray:
         return np.sqrt(self.allreduce(np.square(norms, dtype=float)))
 
-    def block_sums(self, values, offsets):
+    def block_sums(self, values: np.ndarray, offsets: np.ndarray) -> np.ndarray:
         return self.allreduce(np.array([values[a:b].sum(dtype=float) for a, b in zip(offsets[:-1], offsets[1:])]))
 
-    def exscan(self, counts):
+    def exscan(self, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         every = self.allgather(np.asarray(counts))
-        return sum(every[: self.rank], np.zeros_like(counts)), sum(every)
+        none = np.zeros_like(counts)
+        return sum(every[: self.rank], none), sum(every, none)
 
-    def bcast(self, value):
+    def bcast(self, value: T) -> T:
         self._meet()
-        array = isinstance(value, np.ndarray) and value.size > 0
-        about = self._comm.bcast((value.shape, value.dtype.str) if array else None)
+        whole: Any = value
+        array = isinstance(whole, np.ndarray) and whole.size > 0
+        about = self._comm.bcast((whole.shape, whole.dtype.str) if array else None)
         if about is None:
             return self._comm.bcast(value)
-        value = np.empty(*about) if self.rank else np.ascontiguousarray(value)
-        memory = value.reshape(-1).view(np.uint8)
+        whole = np.empty(*about) if self.rank else np.ascontiguousarray(whole)
+        memory = whole.reshape(-1).view(np.uint8)
         for start in range(0, memory.size, PIECE):
             self._comm.Bcast(memory[start : start + PIECE])
-        return value
+        return whole
 
-    def allgather(self, value):
+    def allgather(self, value: T) -> list[T]:
         self._meet()
         return self._comm.allgather(value)
 
-    def alltoall(self, values):
+    def alltoall(self, values: list[T]) -> list[T]:
         self._meet()
         return self._comm.alltoall(values)
 
-    def gather(self, array):
+    def gather(self, array: np.ndarray) -> list[Any] | None:
         about = self.allgather((array.shape, array.dtype.str))
         if self.rank:
             self._send(np.ascontiguousarray(array), 0)
             return None
         return [array, *(self._receive(*about[rank], rank) for rank in range(1, self.size))]
 
-    def scatter(self, arrays):
-        kinds = [(array.shape, array.dtype.str) for array in arrays] if not self.rank else None
+    def scatter(self, arrays: list[np.ndarray] | None) -> np.ndarray:
+        kinds = [(array.shape, array.dtype.str) for array in arrays or ()]
         shape, dtype = self.bcast(kinds)[self.rank]
-        if self.rank:
+        if self.rank or arrays is None:
             return self._receive(shape, dtype, 0)
         for rank in range(1, self.size):
             self._send(np.ascontiguousarray(arrays[rank]), rank)
         return arrays[0]
 
-    def once(self, function, *arguments, **options):
-        result = error = None
+    def once(self, function: Callable[..., T], *arguments: Any, **options: Any) -> T:
+        result: Any = None
+        error: BaseException | None = None
         if self.rank == 0:
             try:
                 result = function(*arguments, **options)
@@ -158,8 +164,9 @@ class MPI(Serial):
             raise self._raised
         return self.bcast(result)
 
-    def together(self, function, *arguments, **options):
-        result = error = None
+    def together(self, function: Callable[..., T], *arguments: Any, **options: Any) -> T:
+        result: Any = None
+        error: BaseException | None = None
         try:
             result = function(*arguments, **options)
         except BaseException as raised:
@@ -170,14 +177,14 @@ class MPI(Serial):
             raise self._raised
         return result
 
-    def same_here(self, value):
+    def same_here(self, value: object) -> int:
         self._meet()
         return self._node.allgather(value).count(value)
 
-    def shared_images(self, count, shape, dtype):
+    def shared_images(self, count: int, shape: tuple[int, ...], dtype: npt.DTypeLike) -> list[np.ndarray]:
         return self._shared(count, shape, dtype) or super().shared_images(count, shape, dtype)
 
-    def shared_slots(self, shape, dtype):
+    def shared_slots(self, shape: tuple[int, ...], dtype: npt.DTypeLike) -> list[np.ndarray] | None:
         return self._shared(self.size, shape, dtype) if self.node_size == self.size else None
 
     def _shared(self, count, shape, dtype):
@@ -199,15 +206,15 @@ class MPI(Serial):
         self._meet()
         return self.node_size > 1 and self._node.bcast(free > 1.1 * size + PIECE // 16)
 
-    def own(self, image):
+    def own(self, image: np.ndarray) -> np.ndarray:
         return image.copy()
 
-    def barrier(self):
+    def barrier(self) -> None:
         if self.node_size > 1:
             self._wait(self._node.Ibarrier())
 
     @contextmanager
-    def guarded(self):
+    def guarded(self) -> Iterator[Serial]:
         try:
             yield self
             self._meet()  # nobody leaves while another may still fail

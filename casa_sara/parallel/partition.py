@@ -33,17 +33,17 @@ class RankAssignment:
         """The share of the visibilities that is this rank's."""
         return 0.0 if self.reader(self.comm.rank) is None else 1 / self.readers
 
-    def reader(self, rank):
+    def reader(self, rank: int) -> int | None:
         """Return the number of a rank among those that hold visibilities, None where it holds none."""
         number, rest = divmod(rank * self.readers, self.comm.size)
         return number if rest < self.readers else None
 
-    def wavelets(self, names):
+    def wavelets(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return this rank's bases, of these."""
         return names if self.owners is None else tuple(name for name, rank in zip(names, self.owners)
                                                        if rank == self.comm.rank)
 
-    def gather_bases(self, coefs):
+    def gather_bases(self, coefs: np.ndarray) -> np.ndarray | None:
         """Return the coefficients of all bases in their order, on rank 0; None on the others."""
         if self.owners is None:
             return coefs
@@ -56,11 +56,11 @@ class RankAssignment:
             parts[rank] = None
         return whole
 
-    def scatter_bases(self, whole):
+    def scatter_bases(self, whole: np.ndarray | None) -> np.ndarray | None:
         """Return this rank's part of the coefficients of rank 0; the others give None."""
         if self.owners is None:
             return whole
-        return self.comm.scatter(None if self.comm.rank
+        return self.comm.scatter(None if whole is None
                                  else [whole[np.equal(self.owners, r)] for r in range(self.comm.size)])
 
 

@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from casa_sara.imaging.continuum import Result
+from casa_sara.imaging.cube import CubeResult
+from casa_sara.options import SolverOptions
 from casa_sara.solver.record import ITERATION_LIMIT, STOP_DESCRIPTIONS
 from casa_sara.version import __version__
 
@@ -26,13 +29,15 @@ PAPER_WHY = {
 }
 
 
-def summary(result, options, full: bool = False) -> dict[str, Any]:
+def summary(result: Result, options: SolverOptions, full: bool = False) -> dict[str, Any]:
     """Return the outcome of a run.
 
     Parameters
     ----------
     result : casa_sara.imaging.continuum.Result
+        The results of the run.
     options : casa_sara.options.SolverOptions
+        Task parameters of the method.
     full : bool
         Add the history of every iteration.
 
@@ -51,13 +56,15 @@ def summary(result, options, full: bool = False) -> dict[str, Any]:
     return _outcome(options, ends, code, {0: {0: minor}}, _sara(result, options, full))
 
 
-def cube_summary(result, options, full: bool = False) -> dict[str, Any]:
+def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False) -> dict[str, Any]:
     """Return the outcome of a run that made a cube.
 
     Parameters
     ----------
     result : casa_sara.imaging.cube.CubeResult
+        The results of the run.
     options : casa_sara.options.SolverOptions
+        Task parameters of the method.
     full : bool
         Add the history of every iteration.
 

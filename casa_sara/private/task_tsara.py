@@ -30,7 +30,7 @@ from casa_sara.imaging.continuum import make_image
 from casa_sara.imaging.cube import make_cube
 from casa_sara.imaging.dry_run import dry_run
 from casa_sara.options import Comparing, ImageGrid, ImagingRequest, Limits, Output, Selection, SolverOptions, Weighting
-from casa_sara.parallel.serial import SERIAL
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.private.launch import in_parallel
 from casa_sara.private.summary import cube_summary, summary
 from casa_sara.runtime.machine import available_cores
@@ -47,7 +47,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
-def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
+def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     """Run the task on the ranks of a communicator, of which rank 0 alone writes; return the same on all."""
     log.info(f"casa_sara {__version__}")
     _check_stokes(parameters)

@@ -68,6 +68,7 @@ def validate(parameters: tuple[Parameter, ...], values: dict[str, Any]) -> dict[
     Parameters
     ----------
     parameters : tuple of Parameter
+        The parameters of the task.
     values : dict
         A value for each parameter, as the user gave it.
 

@@ -73,6 +73,11 @@ class Checkpoint:
     def identify(self, **data: np.ndarray | str | None) -> None:
         """Identify the data, by arrays, their digests or None, and compare them with those of the file that was read.
 
+        Parameters
+        ----------
+        **data : arrays, digests or None
+            What identifies the data, by name.
+
         Raises
         ------
         CheckpointError
@@ -92,6 +97,16 @@ class Checkpoint:
         """Yield `state` to be restored; an error meanwhile means that it does not fit. Afterwards it is released.
 
         With `read` = False it was another rank that has read it, and says so.
+
+        Parameters
+        ----------
+        read : bool
+            Whether this rank is the one that has read the file.
+
+        Returns
+        -------
+        dict or None
+            The state, None where there is none.
         """
         try:
             yield self.state
@@ -107,7 +122,17 @@ class Checkpoint:
         self.state = None
 
     def due(self, now: bool = False) -> bool:
-        """Return whether it is time to write, as it is whenever it has to be `now`."""
+        """Return whether it is time to write, as it is whenever it has to be `now`.
+
+        Parameters
+        ----------
+        now : bool
+            Whether it has to be written in any case.
+
+        Returns
+        -------
+        bool
+        """
         return now or time.monotonic() >= self._due
 
     def keep(self, make_state: Callable[[], dict[str, Any]], iteration: int, now: bool = False) -> None:
@@ -153,7 +178,17 @@ class Checkpoint:
         raise CheckpointError(f"it is of another {name} of casa_sara: {found}, and this is {wanted}")
 
     def refusal(self, reason: object) -> CheckpointError:
-        """Return the error why the run cannot be continued from the file."""
+        """Return the error why the run cannot be continued from the file.
+
+        Parameters
+        ----------
+        reason : object
+            Why the file does not fit, for the message.
+
+        Returns
+        -------
+        CheckpointError
+        """
         return CheckpointError(f"restart = True: '{self.path}' cannot be continued: {reason}. Use the same data and "
                                "parameters, or set restart = False and overwrite = True to start anew, or choose "
                                "another imagename")

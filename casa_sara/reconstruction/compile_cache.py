@@ -44,6 +44,11 @@ def kernels_loading(tell: Callable[[str], None]) -> Iterator[None]:
 
     CASA's tools let other threads go on while they work, so that this costs next to nothing. Kernels that are not
     compiled yet are, which `tell` is told.
+
+    Parameters
+    ----------
+    tell : callable
+        Takes a line for the log.
     """
     mark = _mark()
     if mark is None:
@@ -94,7 +99,7 @@ def _use_operators():
     precond, norm_sq = np.ones(3, np.float32), 3.0 * image.size
     model, _ = nnls(measurement, vis, precond, norm_sq, NNLSFit(max_iter=1))
     no_prior = SimpleNamespace(allocate=lambda: np.zeros(1, np.float32), dual_step=lambda *arguments: None)
-    ppd = AdaptivePPD(measurement, no_prior, vis, [0, 3], precond, norm_sq)
+    ppd = AdaptivePPD(measurement, no_prior, vis, np.array([0, 3]), precond, norm_sq)
     ppd.start_from(model)
     ppd.step()
 

@@ -37,6 +37,7 @@ def block_norms(problem: Problem, problem_of: Callable[..., Problem], options: S
     problem_of : callable
         Makes the `Problem` of samples, with `options`.
     options : SolverOptions
+        Task parameters of the method.
     stopped : callable
         Ends each fit early when it returns True.
 
@@ -66,6 +67,7 @@ def paper_prior(dictionary: SaraDictionary, measurement: Measurement) -> PaperPr
     Parameters
     ----------
     dictionary : SaraDictionary
+        Ψ.
     measurement : Measurement
         Whose threads are used.
 
@@ -83,10 +85,13 @@ def paper_iteration(problem: Problem, dictionary: SaraDictionary, data_norm_sq: 
     Parameters
     ----------
     problem : Problem
+        Data and operators.
     dictionary : SaraDictionary
+        Ψ.
     data_norm_sq : float
         ‖U^½Φ‖².
     positivity : bool
+        x ≥ 0, or only real.
 
     Returns
     -------
@@ -104,11 +109,13 @@ def paper_bounds(ppd: AdaptivePPD, nnls_norms: np.ndarray, weights: np.ndarray,
     Parameters
     ----------
     ppd : AdaptivePPD
+        The iteration, whose model is looked at.
     nnls_norms : float (d,)
         μ_j^NNLS.
     weights : real (M,)
         Squared row scales, in the unit of the model.
     options : SolverOptions
+        Task parameters of the method.
 
     Returns
     -------
@@ -129,6 +136,7 @@ def first_threshold(options: SolverOptions, first: np.ndarray) -> float:
     Parameters
     ----------
     options : SolverOptions
+        Task parameters of the method.
     first : real (nx, ny)
         The image of the search for wild samples.
 

@@ -59,6 +59,7 @@ class Samples:
         Parameters
         ----------
         index : int (n,)
+            Numbers of the samples to leave out.
 
         Returns
         -------
@@ -112,8 +113,11 @@ class Problem:
         Parameters
         ----------
         samples : Samples
+            The samples, sorted into blocks, with their sampling density.
         grid : ImageGrid
+            Size, pixels, direction and gridder of the image.
         options : SolverOptions
+            Task parameters of the method.
         unit_jy : float
             Jy/pixel in the unit of the image.
         eps : float
@@ -121,6 +125,7 @@ class Problem:
         data_norm_sq : float, optional
             ‖U^½Φ‖².
         support : bool (nx, ny), optional
+            Pixels that may be non-zero; all by default.
         comm : casa_sara.parallel.serial.Serial or MPI
             Over whose ranks the samples are spread.
 
@@ -150,9 +155,11 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
     Parameters
     ----------
     samples : Samples
+        The samples, sorted into blocks, with their sampling density.
     problem_of : callable
         Makes the `Problem` of samples.
     options : SolverOptions
+        Task parameters of the method.
     stopped : callable
         Ends the fit early when it returns True.
     comm : casa_sara.parallel.serial.Serial or MPI

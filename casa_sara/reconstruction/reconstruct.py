@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -102,10 +103,13 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     samples : Samples
         With the sampling density, and the noise where it is known.
     grid : ImageGrid
+        Size, pixels, direction and gridder of the image.
     options : SolverOptions
+        Task parameters of the method.
     startmodel : real (nx, ny), optional
         First image, Jy/pixel.
     control : Control
+        What ends the solution early, and keeps its state.
     support : bool (nx, ny), optional
         The model is exactly 0 elsewhere.
     ranks : RankAssignment
@@ -145,8 +149,9 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     """Tell the checkpoint, on rank 0, of what data the solution is: digests of all that it depends on."""
     data = samples.data
     gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=samples.density)
-    digests = {name: digest(whole) for name, array in gathered.items()
-               if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
+    digests: dict[str, str | None] = {
+        name: digest(whole) for name, array in gathered.items()
+        if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
     spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
         blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex).items()}
@@ -158,7 +163,7 @@ def _iterate(solution, options, control, layout, ranks):
     schedule = schedule_of(options)
     if solution.found.noise_only:
         schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
-    run = run_paper_algorithm_2 if options.method == PAPER else run_algorithm_2
+    run: Callable[..., SolverRecord] = run_paper_algorithm_2 if options.method == PAPER else run_algorithm_2
     keep = partial(_keep, solution, control.checkpoint, layout, ranks)
     return run(solution.ppd, solution.bounds, schedule, control.progress, control.stopped, keep, solution.stage)
 
@@ -251,8 +256,9 @@ def _resume(samples, layout, problem_of, options, checkpoint, ranks):
     """Go on from the state that rank 0 has read."""
     with checkpoint.applied(ranks.comm.rank == 0) as state:
         state = _plain_state(state, ranks.comm)
-        found = Findings(**{name: np.array(value) if isinstance(value, np.ndarray) else value
-                            for name, value in state["found"].items()})
+        values: dict[str, Any] = {name: np.array(value) if isinstance(value, np.ndarray) else value
+                                  for name, value in state["found"].items()}
+        found = Findings(**values)
         found.left_out = layout.here(found.left_out)
         problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq)
         solution = _Solution.of(problem, found, options, ranks)
@@ -271,6 +277,7 @@ def check_l2bound(options: SolverOptions, blocks: int) -> None:
     Parameters
     ----------
     options : SolverOptions
+        Task parameters of the method.
     blocks : int
         d.
     """
@@ -295,6 +302,7 @@ def operator_accuracy(data: Visibilities, offsets: np.ndarray, noise: np.ndarray
     Parameters
     ----------
     data : Visibilities
+        The samples.
     offsets : int (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1].
     noise : float (d,) or None
@@ -318,6 +326,7 @@ def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
     Parameters
     ----------
     options : SolverOptions
+        Task parameters of the method.
 
     Returns
     -------

@@ -37,6 +37,7 @@ def write(path: str, header: dict[str, Any], state: dict[str, Any]) -> None:
     Parameters
     ----------
     path : str
+        File to write.
     header : dict
         Plain values.
     state : dict
@@ -65,6 +66,7 @@ def read(path: str) -> tuple[dict[str, Any], dict[str, Any]]:
     Parameters
     ----------
     path : str
+        The file of the checkpoint.
 
     Returns
     -------
@@ -85,7 +87,7 @@ def read(path: str) -> tuple[dict[str, Any], dict[str, Any]]:
     start = len(MAGIC) + 8
     length, = struct.unpack("<Q", raw[len(MAGIC):start].tobytes())
     place = start + length
-    if place + _DIGEST > raw.size or hashlib.sha256(raw[:place]).digest() != raw[place:place + _DIGEST].tobytes():
+    if place + _DIGEST > raw.size or hashlib.sha256(raw[:place].data).digest() != raw[place:place + _DIGEST].tobytes():
         raise CheckpointError("it is truncated or damaged: the checksum of its header is wrong")
     try:
         header = json.loads(raw[start:place].tobytes())
@@ -141,6 +143,7 @@ def digest(array: np.ndarray) -> str:
     Parameters
     ----------
     array : ndarray, C-contiguous
+        Any array.
 
     Returns
     -------

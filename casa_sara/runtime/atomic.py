@@ -28,6 +28,7 @@ def new_file(path: str | os.PathLike) -> Iterator[BinaryIO]:
     Parameters
     ----------
     path : path
+        Path of the file.
 
     Raises
     ------

@@ -31,7 +31,7 @@ def available_memory() -> int:
     or 2, that the process is in; files in a group's cache do not count as used.  Where the kernel tells nothing it is
     all memory.
     """
-    return max(0, min([_machine_memory(), *(_group_memory(*group) for group in _memory_groups())]))
+    return int(max(0, min([_machine_memory(), *(_group_memory(*group) for group in _memory_groups())])))
 
 
 def resident_memory() -> int:

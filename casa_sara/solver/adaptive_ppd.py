@@ -180,6 +180,7 @@ class AdaptivePPD:
         Parameters
         ----------
         support : bool (nx, ny)
+            Pixels that may be non-zero.
         """
         self.confined_to = support
         self.lowest[~support] = np.inf
@@ -193,7 +194,9 @@ class AdaptivePPD:
         Parameters
         ----------
         support : bool (nx, ny)
+            Pixels that may be non-zero.
         points : PointSources
+            Sources that the support holds, of which only the flux is free.
         """
         if self.confined_to is not None:
             support = support & self.confined_to
@@ -265,8 +268,9 @@ class AdaptivePPD:
     def _update_multipliers(self):
         """P_{E_j} of Step 5: the λ_j for which ‖q_j − y_j‖ = ε_j, from those of the iteration before."""
         for j, (start, stop) in enumerate(self.blocks()):
-            block = [whole[start:stop] for whole in (self.l2_dual, self._phi_bar, self.vis, self.precond)]
-            self.multipliers[j] = ellipsoid_multiplier(*block, self.l2_bounds[j], self.multipliers[j], self.comm)
+            self.multipliers[j] = ellipsoid_multiplier(
+                self.l2_dual[start:stop], self._phi_bar[start:stop], self.vis[start:stop], self.precond[start:stop],
+                self.l2_bounds[j], self.multipliers[j], self.comm)
 
     def _update_prior_dual(self):
         """Step 13: u from Ψ†x̄, and its gradient Ψu."""
@@ -358,6 +362,11 @@ class AdaptivePPD:
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned, by copies.
+
+        Parameters
+        ----------
+        state : dict
+            As :meth:`state` has returned it.
 
         Raises
         ------

@@ -14,6 +14,7 @@ def convolve_valid(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     image : real (M, N)
+        The image.
     kernel : real (m, n)
         m ≤ M, n ≤ N.
 

@@ -72,6 +72,7 @@ class PaperSchedule:
         Parameters
         ----------
         options : SolverOptions
+            Task parameters: those that are set to other than their defaults count.
 
         Returns
         -------
@@ -137,6 +138,7 @@ class PaperBounds:
         ppd : AdaptivePPD
             After its step; takes the bounds.
         schedule : PaperSchedule
+            The constants of the method.
 
         Returns
         -------
@@ -157,7 +159,9 @@ class PaperBounds:
         Parameters
         ----------
         ppd : AdaptivePPD
+            The iteration, whose residual norms are compared with the bounds.
         schedule : PaperSchedule
+            The constants of the method.
 
         Returns
         -------
@@ -170,7 +174,13 @@ class PaperBounds:
         return {name: getattr(self, name) for name in self._changing}
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Take over what :meth:`state` has returned."""
+        """Take over what :meth:`state` has returned.
+
+        Parameters
+        ----------
+        state : dict
+            As :meth:`state` has returned it.
+        """
         self.l2_bounds, self._moved = np.array(state["l2_bounds"]), np.array(state["_moved"])
         self._sigma = float(state["_sigma"])
 
@@ -206,7 +216,17 @@ class PaperStage:
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> PaperStage:
-        """Make it of what :meth:`state` has returned."""
+        """Make it of what :meth:`state` has returned.
+
+        Parameters
+        ----------
+        state : dict
+            As :meth:`state` has returned it.
+
+        Returns
+        -------
+        PaperStage
+        """
         stage = cls(np.array(state["previous"]), state["norm"], state["last"])
         stage.record.set_state(state["record"])
         return stage
@@ -224,7 +244,9 @@ def run_paper_algorithm_2(ppd: AdaptivePPD, bounds: PaperBounds, schedule: Paper
     ppd : AdaptivePPD
         With ρ = 1, a `PaperPrior` for dictionary, and κ set (`threshold`).
     bounds : PaperBounds
+        Bounds of the blocks, which are changed.
     schedule : PaperSchedule
+        The constants of the method.
     progress, stopped, keep, stage
         As of :func:`casa_sara.solver.reweighting.run_algorithm_2`.
 

@@ -24,11 +24,35 @@ class Measurement(Protocol):
     workers: Any
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Φ·image, complex (M,), of a real image (nx, ny), in `out` where given."""
+        """Return Φ·image, complex (M,), of a real image (nx, ny), in `out` where given.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            The image.
+        out : array, optional
+            Receives the result.
+
+        Returns
+        -------
+        complex (M,)
+        """
         ...
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return Re(Φ†·vis), real (nx, ny), of complex (M,), in `out` where given."""
+        """Return Re(Φ†·vis), real (nx, ny), of complex (M,), in `out` where given.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            The visibilities.
+        out : array, optional
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         ...
 
 
@@ -79,6 +103,7 @@ class Dictionary(Prior, Protocol):
         Parameters
         ----------
         image : real (nx, ny)
+            The image.
         out : real, of the shape of coefficients, optional
             Receives the result.
 
@@ -94,6 +119,7 @@ class Dictionary(Prior, Protocol):
         Parameters
         ----------
         coefs : real, of the shape of coefficients
+            The coefficients.
         out : real (nx, ny), optional
             Receives the result.
 

@@ -25,7 +25,9 @@ def look_at(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, record: Solv
     Parameters
     ----------
     ppd : AdaptivePPD
+        The iteration at its end, whose model and residual are looked at.
     bounds : GivenBounds or AdaptiveBounds
+        Bounds of its blocks, from which the noise levels follow.
     record : SolverRecord
         `islands` and `residual_snr` are set.
 

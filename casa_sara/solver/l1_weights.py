@@ -27,7 +27,11 @@ def band_noise(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds,
     Parameters
     ----------
     ppd : AdaptivePPD
+        The iteration, whose model is looked at.
     bounds : GivenBounds or AdaptiveBounds
+        Bounds of its blocks, from which the noise levels follow.
+    seed : int
+        Of the random numbers.
 
     Returns
     -------
@@ -108,9 +112,13 @@ def reweight(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, scale: floa
     Parameters
     ----------
     ppd : AdaptivePPD
+        The iteration, whose model is looked at.
     bounds : GivenBounds or AdaptiveBounds
+        Bounds of its blocks, from which the noise levels follow.
     scale : float
+        Scale ω^k of the weights, at least that of the noise.
     confined : bool
+        Whether the model is confined to what is significant.
     """
     noise, pixel = band_noise(ppd, bounds)
     scales = _band_scales(noise, pixel)

@@ -107,11 +107,27 @@ class GivenBounds(_NoiseLevels):
     """Bounds that stay as they are, and are hard constraints ‖y_j − Φ_j x‖ ≤ ε_j of the last problem."""
 
     def finish(self, ppd: AdaptivePPD) -> None:
-        """Make the bounds hard constraints, from where the multipliers have led."""
+        """Make the bounds hard constraints, from where the multipliers have led.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            The iteration, which is told its bounds.
+        """
         ppd.constrain(self.l2_bounds)
 
     def adapt(self, ppd: AdaptivePPD) -> bool:
-        """Nothing adapts; return False."""
+        """Nothing adapts; return False.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            The iteration; it is not looked at.
+
+        Returns
+        -------
+        bool
+        """
         return False
 
     def met_by(self, ppd: AdaptivePPD, slack: float = 1.0) -> bool:
@@ -120,6 +136,7 @@ class GivenBounds(_NoiseLevels):
         Parameters
         ----------
         ppd : AdaptivePPD
+            The iteration, whose residual norms are compared with the bounds.
         slack : float
             Factor on the tolerance.
 
@@ -159,7 +176,13 @@ class AdaptiveBounds(_NoiseLevels):
         self._last_move = np.zeros(len(self.l2_bounds), int)
 
     def finish(self, ppd: AdaptivePPD) -> None:
-        """Nothing changes for the last problem."""
+        """Nothing changes for the last problem.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            The iteration; it is not changed.
+        """
 
     def adapt(self, ppd: AdaptivePPD) -> bool:
         """Steps 7–10; return whether any bound moved.
@@ -190,6 +213,7 @@ class AdaptiveBounds(_NoiseLevels):
         Parameters
         ----------
         ppd : AdaptivePPD
+            The iteration, whose residual norms are compared with the bounds.
         slack : float
             Factor on the tolerance γ2.
 

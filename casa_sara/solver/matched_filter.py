@@ -66,7 +66,17 @@ class MatchedFilter:
         self.sidelobe = float(np.clip(MARGIN * outside, LEAST_SIDELOBE, MOST_SIDELOBE))
 
     def norm(self, scale: int) -> float:
-        """‖Σ^{−½}Φq‖ of template number `scale`."""
+        """‖Σ^{−½}Φq‖ of template number `scale`.
+
+        Parameters
+        ----------
+        scale : int
+            Number of the template, 0 for a point.
+
+        Returns
+        -------
+        float
+        """
         return self._response(scale)[0]
 
     def snr(self, gradient: np.ndarray, scale: int) -> np.ndarray:
@@ -77,6 +87,11 @@ class MatchedFilter:
         gradient : complex
             :meth:`spectrum` of Φ†Σ⁻¹(y − Φx).
         scale : int
+            Number of the template, 0 for a point.
+
+        Returns
+        -------
+        real (nx, ny)
         """
         found = gradient * self._template(self.widths[scale])
         return self._per_noise(self._image(found), scale)
@@ -89,6 +104,11 @@ class MatchedFilter:
         model : real (nx, ny)
             x, or that part of it which is not to be taken as known.
         scale : int
+            Number of the template, 0 for a point.
+
+        Returns
+        -------
+        real (nx, ny)
         """
         near = self._response(scale)[1]
         half = [n // 2 for n in near.shape]
@@ -143,6 +163,7 @@ class MatchedFilter:
         Parameters
         ----------
         image : real (nx, ny)
+            The image to transform.
 
         Returns
         -------
@@ -206,6 +227,7 @@ def distance(shape: tuple[int, int]) -> np.ndarray:
     Parameters
     ----------
     shape : (int, int)
+        Of the image.
 
     Returns
     -------

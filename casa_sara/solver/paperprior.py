@@ -69,6 +69,11 @@ class PaperPrior:
             Receives ζΨWu.
         relaxation : float
             ρ.
+
+        Returns
+        -------
+        real (nx, ny)
+            ζΨWu.
         """
         real = dual.dtype.type
         self.dictionary.analysis(model_bar, self._coefs)

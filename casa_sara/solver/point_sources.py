@@ -47,13 +47,33 @@ class PointSources:
         return len(self.places)
 
     def pixels(self, shape: tuple[int, int]) -> np.ndarray:
-        """Return the pixels of all sources, bool (nx, ny)."""
+        """Return the pixels of all sources, bool (nx, ny).
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Of the image.
+
+        Returns
+        -------
+        bool (nx, ny)
+        """
         covered = np.zeros(shape, bool)
         covered[self.x, self.y] = True
         return covered
 
     def values(self, image: np.ndarray) -> np.ndarray:
-        """Return what an image holds in the pixels of each source, float (n, 36)."""
+        """Return what an image holds in the pixels of each source, float (n, 36).
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            The image.
+
+        Returns
+        -------
+        float (n, 36)
+        """
         return image[self.x, self.y].astype(float)
 
     def project(self, model: np.ndarray, anchor: np.ndarray, model_bar: np.ndarray, before: np.ndarray) -> np.ndarray:

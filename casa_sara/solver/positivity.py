@@ -49,6 +49,7 @@ class Release:
         ppd : AdaptivePPD
             `lowest` is changed in place.
         bounds : GivenBounds or AdaptiveBounds
+            Bounds of its blocks, from which the noise levels follow.
 
         Returns
         -------
@@ -73,7 +74,13 @@ class Release:
         return dict(asked=self._asked)
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Take over what :meth:`state` has returned."""
+        """Take over what :meth:`state` has returned.
+
+        Parameters
+        ----------
+        state : dict
+            As :meth:`state` has returned it.
+        """
         self._asked = np.array(state["asked"])
 
 

@@ -73,9 +73,11 @@ def project_ellipsoid(point: np.ndarray, centre: np.ndarray, precond: np.ndarray
     Parameters
     ----------
     point, centre : complex (M,)
+        The point to project, and the centre of the ball.
     precond : real (M,)
         U > 0.
     bound : float
+        Radius ε > 0.
 
     Returns
     -------

@@ -73,7 +73,7 @@ class SolverRecord:
         """The stop code in words."""
         return STOP_DESCRIPTIONS.get(self.stop_code, "not finished")
 
-    def note(self, ppd, reweighting: int) -> None:
+    def note(self, ppd: Any, reweighting: int) -> None:
         """Add the state of the iteration `ppd`.
 
         Parameters
@@ -95,7 +95,13 @@ class SolverRecord:
         return vars(self) | dict(bounds=[(iteration, bounds.tolist()) for iteration, bounds in self.bounds])
 
     def set_state(self, state: dict[str, Any]) -> None:
-        """Take over what :meth:`state` has returned, and note that the solution was resumed."""
+        """Take over what :meth:`state` has returned, and note that the solution was resumed.
+
+        Parameters
+        ----------
+        state : dict
+            As :meth:`state` has returned it.
+        """
         for name in vars(self):
             setattr(self, name, state[name])
         self.bounds = [(iteration, np.array(bounds)) for iteration, bounds in self.bounds]

@@ -124,7 +124,17 @@ class Stage:
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Stage:
-        """Make it of what :meth:`state` has returned."""
+        """Make it of what :meth:`state` has returned.
+
+        Parameters
+        ----------
+        state : dict
+            As :meth:`state` has returned it.
+
+        Returns
+        -------
+        Stage
+        """
         stage = cls(np.array(state["previous"]), state["last"], state["start"], state["settled"])
         stage.release.set_state(state["release"])
         stage.support = state["support"] and SignificantSupport(**state["support"])
@@ -148,7 +158,9 @@ def run_algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, sche
     ppd : AdaptivePPD
         The iteration, with its first κ (`threshold`) set.
     bounds : GivenBounds or AdaptiveBounds
+        Bounds of the blocks, which are changed where they adapt.
     schedule : Schedule
+        Tolerances and numbers of iterations and of re-weightings.
     progress : callable
         Called after every iteration with (ppd, record).
     stopped : callable

@@ -114,7 +114,9 @@ def matched_filter(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> Ma
     Parameters
     ----------
     ppd : AdaptivePPD
+        The iteration, whose model is looked at.
     bounds : GivenBounds or AdaptiveBounds
+        Bounds of its blocks, from which the noise levels follow.
 
     Returns
     -------
@@ -129,7 +131,9 @@ def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> np
     Parameters
     ----------
     ppd : AdaptivePPD
+        The iteration, whose model is looked at.
     bounds : GivenBounds or AdaptiveBounds
+        Bounds of its blocks, from which the noise levels follow.
 
     Returns
     -------
@@ -149,7 +153,9 @@ def gradient_image(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, model
     Parameters
     ----------
     ppd : AdaptivePPD
+        The iteration, whose model is looked at.
     bounds : GivenBounds or AdaptiveBounds
+        Bounds of its blocks, from which the noise levels follow.
     model : real (nx, ny)
         x, in the unit of the iteration.
 

@@ -31,11 +31,13 @@ def unresolved(filter_: MatchedFilter, gradient: np.ndarray, model: np.ndarray, 
     Parameters
     ----------
     filter_ : MatchedFilter
+        The templates of points and Gaussians.
     gradient : real (nx, ny)
         Φ†Σ⁻¹(y − Φx).
     model : real (nx, ny)
         x.
     support : bool (nx, ny)
+        Where emission is significant.
     allowed : bool (nx, ny)
         Where the pixels of a point may be.
     significance : float

@@ -23,8 +23,11 @@ def write_image(name, pixels, plane, unit="", beam=None, masked=False):
     Parameters
     ----------
     name : str
+        Path of the image.
     pixels : real (nx, ny) or (nchan, nx, ny)
+        The pixels, in `unit`.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
     unit : str
         'Jy/pixel', 'Jy/beam', or '' as tclean leaves it on .psf, .residual, .pb and .sumwt.
     beam : dict or list of nchan dict, optional
@@ -75,6 +78,7 @@ def read_model(name, plane, channel=0):
     name : str
         A CASA image or a FITS file in Jy/pixel, or a unit that can be converted to it.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
     channel : int
         Of the image; a model of one channel serves all of them.
 

@@ -78,7 +78,9 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
     visibilities : casa_sara.data.visibilities.Visibilities
         What was read, for its phase centre and the MeasurementSets that it comes from.
     selection : casa_sara.options.Selection
+        The MeasurementSets and the data selected in them.
     grid : casa_sara.options.ImageGrid
+        Size, pixels, direction and gridder of the image.
     pblimit : float
         |pblimit| is the lowest primary beam; where it is negative, only .pb and what is divided by it are masked.
     channels : int

@@ -15,6 +15,7 @@ def located(islands, plane, cell_rad):
     islands : list of dict
         Of :func:`casa_sara.solver.islands.islands_of`.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
     cell_rad : (float, float)
         Pixel size.
 

@@ -26,6 +26,7 @@ def read_support(grid, plane):
     grid : casa_sara.options.ImageGrid
         Its `usemask`, `mask` and `pbmask`.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
 
     Returns
     -------

@@ -106,10 +106,12 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     output : casa_sara.options.Output
         Its `imagename`, `restoringbeam` and `history`, lines for the history of every image.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
         residual in Jy/beam) and 'model' in Jy/pixel; 'mask' where there is one.
     sumwt : float, or one for each channel
+        Sum of the imaging weights.
     beam : dict
         Of `restore.fit_beam`, or a list with one for each channel.
     record : dict, optional
@@ -172,6 +174,7 @@ def history_lines(taskname, parameters):
     Parameters
     ----------
     taskname : str
+        Name of the task.
     parameters : dict
         Task parameters, in order.
     """

@@ -70,7 +70,9 @@ def on_plane(pixels, place, shape):
     Parameters
     ----------
     pixels : float32 (nx, ny)
+        The image.
     place : PixelMap, from the pixels of this image to those of the other
+        Pixel coordinates in the image, for each pixel of the result.
     shape : (int, int)
         Of the other.
 
@@ -103,7 +105,9 @@ def interpolated(pixels, place, shape):
     Parameters
     ----------
     pixels : real (nx, ny)
+        The image.
     place : PixelMap, from the pixels of the other image to those of this one
+        Pixel coordinates in the image, for each pixel of the result.
     shape : (int, int)
         Of the other.
 

@@ -23,7 +23,9 @@ def fit_beam(psf, plane):
     Parameters
     ----------
     psf : float32 (nx, ny), 1 at the centre
+        The point spread function, 1 at its peak.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
 
     Returns
     -------
@@ -91,6 +93,7 @@ def restore(root, restoringbeam=(), specmode="mfs"):
     Parameters
     ----------
     root : str
+        Name of the images without suffix.
     restoringbeam : str or sequence
         See `restoring_beam_words`.
     specmode : str
@@ -125,8 +128,11 @@ def write_corrected(root, plane, model):
     Parameters
     ----------
     root : str
+        Name of the images without suffix.
     plane : ImagePlane
+        The image plane: coordinates, primary beam, mask.
     model : float32 (nx, ny) or (nchan, nx, ny), Jy/pixel
+        The model.
     """
     with opened("image", root + ".image") as ia:
         image = np.array([read_pixels(ia, number=k) for k in range(plane.channels)]).reshape(plane.pb.shape)

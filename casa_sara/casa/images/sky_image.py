@@ -233,6 +233,7 @@ def unit_of(text, csys):
     Parameters
     ----------
     text : str
+        A unit as other software spells it.
     csys : casatools.coordsys
         Directions in radians.
     """

@@ -159,9 +159,11 @@ def channels_of(visibilities, selection, axis):
     Parameters
     ----------
     visibilities : casa_sara.data.visibilities.Visibilities
+        The samples.
     selection : casa_sara.options.Selection
         That gave them.
     axis : SpectralAxis
+        The channels of the cube.
     """
     rows = visibilities.rows
     channel = np.full(visibilities.size, -1, np.int32)

@@ -34,6 +34,7 @@ def with_spectrum(grid, plane, reference=None):
     Parameters
     ----------
     grid : casa_sara.options.ImageGrid
+        Size, pixels, direction and gridder of the image.
     plane : ImagePlane or SkyPlane
         `csys` and `shape`.
     reference : ImagePlane or SkyPlane, optional

@@ -27,7 +27,9 @@ def divide(visibilities, blocks, comm=SERIAL):
     Parameters
     ----------
     visibilities : Visibilities
+        The samples.
     blocks : int or tuple of str
+        As of :class:`casa_sara.options.Output`.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
 

@@ -46,9 +46,11 @@ def measure_volume(selection, flags=False, stokes="I"):
     Parameters
     ----------
     selection : casa_sara.options.Selection
-    stokes : str
+        The MeasurementSets and the data selected in them.
     flags : bool
         Read the flags too, so that the count is exact but for data and weights that are not finite.
+    stokes : str
+        Stokes parameter of the image.
 
     Returns
     -------

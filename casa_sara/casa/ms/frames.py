@@ -40,6 +40,7 @@ def image_direction(phasecenter, selected):
         tclean; a field number (int, or a str of digits), or '[FRAME] LONGITUDE LATITUDE'. A field in a frame that turns
         with the Earth stands for where it is when the observation begins, in J2000.
     selected : list of SelectedMS
+        The selected data of all MeasurementSets.
     """
     first = selected[0]
     return _as_kept(on_sky(_direction_of(phasecenter, first), first, first.start_s))
@@ -241,6 +242,7 @@ def turn_to_frame(direction, frame, epoch_s=None):
     direction : dict
         Direction measure.
     frame : str
+        Name of the frame of the image.
     epoch_s : float, optional
         As of :func:`rotation_between`.
 
@@ -288,9 +290,13 @@ class Geometry:
         Parameters
         ----------
         group : RowGroup
+            Rows of one spectral window.
         field : int (R,), field numbers
+            Field of each row.
         time : float64 (R,), MJD seconds
+            MJD seconds of each row.
         uvw_m : float64 (3, R), metres at the field's phase centre
+            Baselines in metres.
 
         Returns
         -------

@@ -44,6 +44,7 @@ def check_model_column_writable(selection):
     Parameters
     ----------
     selection : casa_sara.options.Selection
+        The MeasurementSets and the data selected in them.
 
     Raises
     ------
@@ -127,6 +128,7 @@ def write_model_column(selection, phase_center, predict):
     Parameters
     ----------
     selection : casa_sara.options.Selection
+        The MeasurementSets and the data selected in them.
     phase_center : dict
         Direction of the image centre, `Visibilities.phase_center`.
     predict : callable

@@ -46,6 +46,7 @@ def msselect(name, strings):
     Parameters
     ----------
     name : str
+        Path of the MeasurementSet.
     strings : dict
         Task parameter → expression, none of them empty.
 

@@ -65,6 +65,7 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     Parameters
     ----------
     selection : casa_sara.options.Selection
+        The MeasurementSets and the data selected in them.
     phasecenter : str or int
         Image centre, as in tclean; '' is that of the first selected field.
     stokes : str

@@ -114,6 +114,7 @@ def select_data(selection, stokes=""):
     Parameters
     ----------
     selection : casa_sara.options.Selection
+        The MeasurementSets and the data selected in them.
     stokes : str
         'I', 'Q', 'U' or 'V', which must be in the data; '' where their correlations do not matter.
 

@@ -187,6 +187,7 @@ def readable(name, diameters=False):
     Parameters
     ----------
     name : str
+        Path of the MeasurementSet.
     diameters : bool
         Give all antennas a diameter, without which CASA may make no primary beam.
 
@@ -204,6 +205,7 @@ def check_rows(name, **rows):
     Parameters
     ----------
     name : str
+        Path of the MeasurementSet.
     **rows : sequence of int
         Row numbers by the name of the subtable.
 

@@ -25,6 +25,8 @@ def lacking_cells(tb, name, wanted):
     ----------
     tb : casatools.table
         The main table of the MeasurementSet `name`, open.
+    name : str
+        Path of the MeasurementSet.
     wanted : dict
         Data description → its rows (int64, increasing), and a dict: column → shape (tuple of int) of its cells.
 
@@ -128,6 +130,7 @@ def read_slice(part, column, there, low, high, dtype):
     part : casatools.table
         R rows.
     column : str
+        Name of the column.
     there : bool (R,)
         Whether a row holds a cell.
     low, high : list of int

@@ -45,10 +45,12 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     Parameters
     ----------
     visibilities : casa_sara.data.visibilities.Visibilities
+        The samples.
     selection : casa_sara.options.Selection or None
         That is read again; None where the samples are not all of a selection, but those of one channel of a cube, and
         so are counted here.
     grid : casa_sara.options.ImageGrid
+        Size, pixels, direction and gridder of the image.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread; rank 0 asks imager.
 
@@ -96,8 +98,11 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     Parameters
     ----------
     visibilities : casa_sara.data.visibilities.Visibilities
+        The samples.
     grid : casa_sara.options.ImageGrid
+        Size, pixels, direction and gridder of the image.
     weighting : casa_sara.options.Weighting
+        Imaging weights that were asked for.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
 
@@ -147,8 +152,11 @@ def dirty_image(operator, vis, weights, comm=SERIAL):
     Parameters
     ----------
     operator : MeasurementOperator, without whitening
+        The measurement operator without weights.
     vis : complex (M,), or 1
+        Jy.
     weights : real (M,)
+        Imaging weights.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread; the operator sums over them.
 

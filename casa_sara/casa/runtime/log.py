@@ -114,7 +114,9 @@ class Progress:
         Parameters
         ----------
         iteration : int
+            Number of iterations done.
         message : str
+            Text for the log.
         fraction : float, optional
             Estimate of the part of the iterations that is done, 0 to 1.
         """
@@ -132,6 +134,7 @@ class Progress:
         Parameters
         ----------
         message : str
+            Text for the log.
         log : bool
             Write it to the log too, not to the terminal only.
         """

@@ -33,6 +33,7 @@ def made(path, parameter):
     Parameters
     ----------
     path : str
+        Path of the new image.
     parameter : str
         Task parameter with its value, for the message.
 
