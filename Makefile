@@ -1,14 +1,31 @@
-# make test, make demo, make docs: everything they need is set up on the first call, in $(VENV), offline from then on.
+# make test, make lint, make demo, make docs: what they need is set up on the first call, in $(VENV) and build, offline
+# from then on.
 #   make PYTHON=python3.12 VENV=.venv312 test    another Python, another environment
 
 PYTHON ?= python3
 VENV ?= .venv
 python := $(abspath $(VENV))/bin/python
 
-.PHONY: test demo docs install tasks dist clean
+.PHONY: test lint coverage demo docs install tasks dist clean
 
 test: install
 	$(python) -m pytest
+
+# Style, docstrings and complexity (ruff), types of the numerics (mypy), who imports whom (import-linter): pyproject.toml.
+lint: $(VENV)/installed build/lint/installed
+	build/lint/bin/ruff check .
+	build/lint/bin/mypy --python-executable $(python)
+	build/lint/bin/lint-imports --cache-dir build/lint/imports
+
+build/lint/installed: Makefile
+	$(PYTHON) -m venv build/lint
+	build/lint/bin/python -m pip install --quiet --disable-pip-version-check 'ruff ==0.17.*' 'mypy ==2.*' 'import-linter ==2.*'
+	touch $@
+
+# Which lines the tests reach: make coverage, or make coverage TESTS=tests/test_solver.py. Compiled kernels are not seen.
+coverage: install
+	$(python) -m pip install --quiet --disable-pip-version-check 'pytest-cov ==7.*'
+	$(python) -m pytest --cov=casa_sara --cov-report=term:skip-covered $(TESTS)
 
 demo: install
 	$(python) -m casa_sara.demo
