@@ -23,8 +23,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from machine import bandwidth, machine
 
+from casa_sara.operators._decimation_kernels import decimate, expand, expand_rows, scratch_shape
 from casa_sara.operators._workers import Workers
-from casa_sara.operators.decimation import AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable
+from casa_sara.operators.decimation import AxisDecimation, separable
 from casa_sara.operators.measurement import MeasurementOperator
 
 CASES = [(512, 256, 100_000), (1024, 1024, 100_000), (1024, 1024, 1_000_000), (2048, 2048, 1_000_000),

@@ -10,22 +10,29 @@ of the synthesis, which keeps the frame Parseval.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-import pywt
 from scipy.ndimage import maximum_filter
 
 from casa_sara.operators import _wavelet_kernels as kernels, _wavelet_lines as lines
+from casa_sara.operators._coefficient_layout import (
+    aligned,
+    approximations,
+    displacement,
+    filter_lengths,
+    filters,
+    padded_shape,
+    rectangle,
+    shares,
+)
 from casa_sara.operators._wavelet_weights import RING_ROWS, neighbourhood_weights
 from casa_sara.operators._workers import Workers
 from casa_sara.options import SARA_BASES
 
 __all__ = ["Band", "SaraDictionary", "coefficient_bytes", "filter_lengths"]
 
-CACHE_LINE = 64
 ORIENTATIONS = ("aa", "ad", "da", "dd")
 
 
@@ -81,15 +88,15 @@ class SaraDictionary:
         self.dtype: np.dtype[Any] = np.dtype(dtype)
         self.n_bases = len(self.wavelets) if n_bases is None else int(n_bases)
         self._validate()
-        padded = _padded(self.shape, self.levels)
+        padded = padded_shape(self.shape, self.levels)
         self.coef_shape = (len(self.wavelets), *padded)
         self.n_coefs = len(self.wavelets) * padded[0] * padded[1]
-        self._filters = _filters(self.wavelets, self.n_bases, self.dtype)
+        self._filters = filters(self.wavelets, self.n_bases, self.dtype)
         self._workers = Workers(nthreads)
         self._work = self._workspaces()
         self._params = np.zeros((len(self.wavelets), 2), self.dtype)
         self._ring = np.zeros((self._workers.count, RING_ROWS, padded[1]), self.dtype)
-        self._rectangles = np.array([_rectangle(band) for band in self.bands()], np.int64).reshape(-1, 5)
+        self._rectangles = np.array([rectangle(band) for band in self.bands()], np.int64).reshape(-1, 5)
 
     def _validate(self):
         if len(self.shape) != 2 or min(self.shape) < 1:
@@ -105,18 +112,18 @@ class SaraDictionary:
     def _workspaces(self):
         nx, ny = self.coef_shape[1:]
         size, threads = self.dtype.itemsize, self._workers.count
-        approx = _approximations((nx, ny), self.levels, size)
+        approx = approximations((nx, ny), self.levels, size)
         width = kernels.padded_width(ny + 2 * kernels.HALO, size)
         return kernels.Work(
-            levels=self.levels, approx=_aligned((len(self.wavelets), approx), self.dtype),
-            owner=_shares(self._filters.lengths, threads),
-            window=_aligned((threads, kernels.WINDOW_ROWS, width), self.dtype),
-            scratch=_aligned((threads, lines.SCRATCH_ROWS, width), self.dtype),
+            levels=self.levels, approx=aligned((len(self.wavelets), approx), self.dtype),
+            owner=shares(self._filters.lengths, threads),
+            window=aligned((threads, kernels.WINDOW_ROWS, width), self.dtype),
+            scratch=aligned((threads, lines.SCRATCH_ROWS, width), self.dtype),
             tables=np.zeros((threads, 2, lines.TABLE_SIZE), np.int64))
 
     def allocate(self) -> np.ndarray:
         """Return a zeroed coefficient array of `coef_shape`, aligned as the kernels like it."""
-        return _aligned(self.coef_shape, self.dtype)
+        return aligned(self.coef_shape, self.dtype)
 
     def bands(self) -> list[Band]:
         """Return the list of all :class:`Band`, level 1 the finest.
@@ -277,7 +284,7 @@ class SaraDictionary:
         for band in self.bands():
             where = pixels
             if band.level:
-                by = _displacement(self.wavelets[band.basis], band.level)
+                by = displacement(self.wavelets[band.basis], band.level)
                 where = np.roll(blocks[band.level], [by[kind] for kind in band.orientation], (0, 1))
             coefs[band.slice][where] *= self.dtype.type(factor)
 
@@ -297,30 +304,6 @@ class SaraDictionary:
         self._workers.run(kernels.transform, kernels.BOTH_DEEPER if back else kernels.ANALYSE_DEEPER, image, job)
 
 
-@cache
-def _displacement(wavelet, level):
-    """Coefficients by which approximations 'a' and details 'd' of a level lie off the pixels that they describe."""
-    size = 64 << level
-    pixel = np.zeros(size)
-    pixel[size // 2] = 1
-    approximation, detail = pywt.wavedec(pixel, wavelet, mode="periodization", level=level)[:2]
-    places = np.arange(approximation.size) - approximation.size // 2
-    return {kind: int(np.rint(np.vdot(coefs**2, places) / np.vdot(coefs, coefs)))
-            for kind, coefs in (("a", approximation), ("d", detail))}
-
-
-def _padded(shape, levels):
-    """The next multiples of 2**levels."""
-    block = 1 << levels
-    return tuple(-(-n // block) * block for n in shape)
-
-
-def _approximations(padded, levels, itemsize):
-    """Pixels of the approximations of one basis."""
-    nx, ny = padded
-    return sum((nx >> level) * kernels.padded_width(ny >> level, itemsize) for level in range(1, levels))
-
-
 def coefficient_bytes(shape: tuple[int, int], n_bases: int, levels: int,
                       dtype: npt.DTypeLike = np.float32) -> tuple[int, int]:
     """Memory of one array of coefficients, and of the workspace of a dictionary, in bytes.
@@ -330,7 +313,7 @@ def coefficient_bytes(shape: tuple[int, int], n_bases: int, levels: int,
     shape : (int, int)
         Pixels of the image.
     n_bases, levels : int
-        Number of bases.
+        Numbers of bases, and of levels of the wavelets.
     dtype : float32 or float64
         Precision of the coefficients.
 
@@ -338,64 +321,7 @@ def coefficient_bytes(shape: tuple[int, int], n_bases: int, levels: int,
     -------
     int, int
     """
-    padded, size = _padded(shape, levels), np.dtype(dtype).itemsize
-    return n_bases * padded[0] * padded[1] * size, n_bases * _approximations(padded, levels, size) * size
+    padded, size = padded_shape(shape, levels), np.dtype(dtype).itemsize
+    return n_bases * padded[0] * padded[1] * size, n_bases * approximations(padded, levels, size) * size
 
 
-def _rectangle(band):
-    """Basis, first row, end row, first column and end column of a band."""
-    basis, rows, columns = band.slice
-    return basis, rows.start, rows.stop, columns.start, columns.stop
-
-
-def _aligned(shape, dtype):
-    """Zeros that begin on a cache line, on huge pages where the system offers them (np.zeros gives neither)."""
-    size = int(np.prod(shape))
-    buffer = np.empty(size + CACHE_LINE // dtype.itemsize, dtype)
-    begin = -buffer.ctypes.data % CACHE_LINE // dtype.itemsize
-    array = buffer[begin:begin + size].reshape(shape)
-    array.fill(0)
-    return array
-
-
-def _filters(wavelets, n_bases, dtype):
-    """Lay the taps out as the kernels read them."""
-    gain = 1 / np.sqrt(n_bases)
-    lengths = filter_lengths(wavelets)
-    analysis = np.zeros((2, len(wavelets), 2, kernels.MAX_TAPS))
-    synthesis = np.zeros_like(analysis)
-    for b, (name, length) in enumerate(zip(wavelets, lengths)):
-        if length:
-            wavelet = pywt.Wavelet(name)
-            taps = np.array([wavelet.dec_lo[::-1], wavelet.dec_hi[::-1]])
-            analysis[0, b, :, :length] = taps
-            odd = length // 2 % 2  # even pixels meet the even taps, and the odd the odd
-            even_pixels, odd_pixels = taps[:, 1 - odd::2], taps[:, odd::2]
-            synthesis[0, b, 0, :length] = even_pixels[:, ::-1].T.ravel()
-            synthesis[0, b, 1, :length] = odd_pixels[:, ::-1].T.ravel()
-    analysis[1], synthesis[1] = gain * analysis[0], gain * synthesis[0]
-    return kernels.Filters(lengths, analysis.astype(dtype), synthesis.astype(dtype), dtype.type(gain))
-
-
-def filter_lengths(wavelets: Sequence[str]) -> np.ndarray:
-    """Return the number of taps of each basis, int (b,), 0 for Dirac.
-
-    Parameters
-    ----------
-    wavelets : sequence of str
-        Names of the bases, 'dirac' or those of PyWavelets.
-
-    Returns
-    -------
-    int64 (b,)
-    """
-    return np.array([0 if name == "dirac" else pywt.Wavelet(name).dec_len for name in wavelets], np.int64)
-
-
-def _shares(costs, workers):
-    """Give every task to the worker with the least to do, the costly ones first."""
-    owner, load = np.zeros(len(costs), np.int64), np.zeros(workers)
-    for task in np.argsort(-costs, kind="stable"):
-        owner[task] = np.argmin(load)
-        load[owner[task]] += costs[task]
-    return owner

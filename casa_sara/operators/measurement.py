@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from casa_sara.operators._decimation_kernels import decimate, expand, expand_rows, scratch_shape
 from casa_sara.operators._workers import Workers
-from casa_sara.operators.decimation import AxisDecimation, decimate, expand, expand_rows, scratch_shape, separable
+from casa_sara.operators.decimation import AxisDecimation, separable
 from casa_sara.operators.nufft import NonUniformFFT, memory_size
 from casa_sara.parallel.serial import SERIAL, Serial
 
