@@ -13,6 +13,7 @@ from casa_sara.casa.ms.weights import dirty_image, imaging_weights
 from casa_sara.casa.runtime import log
 from casa_sara.comparison.injection import spectral_index_of
 from casa_sara.data.blocks import snapshot_blocks
+from casa_sara.imaging.plane_images import IMAGE_EPS
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, Weighting
@@ -20,7 +21,6 @@ from casa_sara.reconstruction.compile_cache import kernels_loading
 
 __all__ = ["Observed"]
 
-IMAGE_EPS = 1e-6  # accuracy of the residual images
 SMALLEST_W_PHASE = 0.01  # rad, in the corners of the image, that is worth the w-term
 
 

@@ -14,7 +14,7 @@ from casa_sara.parallel.serial import SERIAL
 
 __all__ = ["IMAGE_EPS", "PlaneImages", "plane_images", "point_spread"]
 
-IMAGE_EPS = 1e-6  # accuracy of the PSF, the residual image and the model column
+IMAGE_EPS = 1e-6  # accuracy of the PSF, residual images and the model column
 
 
 @dataclass
