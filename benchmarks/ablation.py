@@ -148,7 +148,7 @@ def solved(task: tuple[str, str, str], base: Path) -> dict:
     from casa_sara.casa.ms.weights import dirty_image
     from casa_sara.operators.sky import sky_operator
     from casa_sara.options import SolverOptions
-    from casa_sara.reconstruction import reconstruct
+    from casa_sara.reconstruction.reconstruct import reconstruct
     from casa_sara.reconstruction.problem import Samples
 
     rule, kind, name = task

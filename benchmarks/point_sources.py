@@ -111,7 +111,7 @@ def solved(scene: Scene, base: Path) -> dict:
     """Image a scene, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.reconstruction import reconstruct
+    from casa_sara.reconstruction.reconstruct import reconstruct
     from casa_sara.reconstruction.problem import Samples
 
     _, _, part, density, grid = observed(scene.samples_of, base)

@@ -46,7 +46,7 @@ def solved(case: Case, base: Path) -> dict:
     """Image a case, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.reconstruction import reconstruct
+    from casa_sara.reconstruction.reconstruct import reconstruct
     from casa_sara.reconstruction.problem import Samples
 
     sky, simulated, part, density, grid = observed(case, base)

@@ -61,7 +61,7 @@ def _spoil(data):
 def alone(vis, folder):
     """What one process finds, by the name of the run."""
     found = {}
-    chunk, ms_module._CHUNK = ms_module._CHUNK, mpi_steps.ms._CHUNK
+    chunk, ms_module._CHUNK = ms_module._CHUNK, mpi_steps.read._CHUNK
     for name, parameters in _runs(vis, folder / "alone").items():
         found[name] = mpi_steps.run(**parameters)
     ms_module._CHUNK = chunk

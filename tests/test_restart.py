@@ -71,7 +71,7 @@ def run(folder, parameters, place, moment, number):
     continuum.read_visibilities = watched(continuum.read_visibilities, "read")
     problem.power_method = watched(problem.power_method, "norm")
     os.replace = watched(os.replace, "checkpoint")
-    products._sync = watched(products._sync, "product")  # written, not yet in place
+    products.sync = watched(products.sync, "product")  # written, not yet in place
     os.chdir(folder)
     result = tsara(**parameters)
     print("STOPPED WITH", result["stopcode"], result["iterdone"], flush=True)

@@ -26,7 +26,7 @@ before = loaded()
 
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.reconstruction.problem import Samples
-from casa_sara.reconstruction import reconstruct
+from casa_sara.reconstruction.reconstruct import reconstruct
 from casa_sara.data.visibilities import RowTable, Visibilities
 
 rng = np.random.default_rng(5)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from casa_sara.private import parameters
 from casa_sara.private.validation import Parameter
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -206,24 +207,28 @@ def test_check_names_every_stale_file_and_writes_nothing(tmp_path, capsys):
     folder = tmp_path / "casa_sara"
     (folder / "tasks" / "small.py").write_text("# edited\n")
     (folder / "gotasks" / "tiny.py").unlink()
+    (folder / "private" / "parameters.py").unlink()
     (folder / "gotasks" / "old.py").write_text("# of a task that is no more\n")
     capsys.readouterr()
     assert xml2task.main([*command, "--check"]) == 1
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[1] for line in lines] == [
-        "casa_sara/gotasks/old.py", "casa_sara/gotasks/tiny.py", "casa_sara/tasks/small.py"]
+        "casa_sara/gotasks/old.py", "casa_sara/gotasks/tiny.py", "casa_sara/private/parameters.py", "casa_sara/tasks/small.py"]
     assert (folder / "tasks" / "small.py").read_text() == "# edited\n"
     assert xml2task.main(command) == 0 and xml2task.main([*command, "--check"]) == 0
     assert not (folder / "gotasks" / "old.py").exists()
 
 
-def test_generated_task_has_what_the_xml_has(tmp_path):
+def test_generated_task_has_what_the_xml_has(tmp_path, monkeypatch):
     xml = write(tmp_path, SMALL)
-    module = {}
-    exec(compile(xml2task.plain_task(taskxml.read_task(xml)), str(xml), "exec"), module)
+    task = taskxml.read_task(xml)
+    tables, module = {}, {}
+    exec(compile(xml2task.parameter_tables([task]), str(xml), "exec"), tables)
+    monkeypatch.setattr(parameters, "SMALL", tables["SMALL"], raising=False)
+    exec(compile(xml2task.plain_task(task), str(xml), "exec"), module)
     defaults = {name: p.default for name, p in inspect.signature(module["small"]).parameters.items()}
     assert defaults == {"vis": "", "mode": "soft", "softness": 0.5, "steps": 3, "names": ["a"]}
-    assert module["PARAMETERS"] == (
+    assert tables["SMALL"] == module["SMALL"] == (
         Parameter("vis", ("path", "pathVec"), "", "Input", mustexist=True, required=True),
         Parameter("mode", ("string",), "soft", "Mode", allowed=("soft", "hard")),
         Parameter("softness", ("double",), 0.5, "Softness", minimum=0, maximum=1, opener="mode", open_on=("soft",)),

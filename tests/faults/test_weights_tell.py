@@ -146,23 +146,23 @@ class Ranks(Serial):
     def __init__(self, rank, barrier, values):
         self.rank, self.size, self._barrier, self._values = rank, barrier.parties, barrier, values
 
-    def gather(self, value):
+    def allgather(self, value):
         self._barrier.wait()
         self._values[self.rank] = value
         self._barrier.wait()
         return list(self._values)
 
-    def sum(self, array):
-        return np.sum(self.gather(array), axis=0)
+    def allreduce(self, array):
+        return np.sum(self.allgather(array), axis=0)
 
     def total(self, number):
-        return sum(self.gather(number))
+        return sum(self.allgather(number))
 
     def largest(self, number):
-        return max(self.gather(number))
+        return max(self.allgather(number))
 
     def median(self, values):
-        return np.median(np.concatenate(self.gather(values)))
+        return np.median(np.concatenate(self.allgather(values)))
 
 
 def test_ranks_do_not_matter(copy):
