@@ -6,10 +6,16 @@ PYTHON ?= python3
 VENV ?= .venv
 python := $(abspath $(VENV))/bin/python
 
-.PHONY: test lint coverage demo docs install tasks dist clean
+.PHONY: test test-slow test-all lint coverage demo docs install tasks dist clean
 
 test: install
-	$(python) -m pytest
+	$(python) -m pytest -m "not slow"
+
+# The tests that take longest; test-all runs both.
+test-slow: install
+	$(python) -m pytest -m slow
+
+test-all: test test-slow
 
 # Style, docstrings and complexity (ruff), types of the numerics (mypy), who imports whom (import-linter): pyproject.toml.
 lint: $(VENV)/installed build/lint/installed

@@ -148,8 +148,8 @@ def solved(task: tuple[str, str, str], base: Path) -> dict:
     from casa_sara.casa.ms.weights import dirty_image
     from casa_sara.operators.sky import sky_operator
     from casa_sara.options import SolverOptions
-    from casa_sara.reconstruction.reconstruct import reconstruct
     from casa_sara.reconstruction.problem import Samples
+    from casa_sara.reconstruction.reconstruct import reconstruct
 
     rule, kind, name = task
     seen = read(kind, name, base)

@@ -62,8 +62,8 @@ def row(name, base, niter):
     """A line of the table for each method."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.reconstruction.reconstruct import reconstruct
     from casa_sara.reconstruction.problem import Samples
+    from casa_sara.reconstruction.reconstruct import reconstruct
 
     simulated = name in SCENES
     if simulated:

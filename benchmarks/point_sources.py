@@ -111,8 +111,8 @@ def solved(scene: Scene, base: Path) -> dict:
     """Image a scene, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.reconstruction.reconstruct import reconstruct
     from casa_sara.reconstruction.problem import Samples
+    from casa_sara.reconstruction.reconstruct import reconstruct
 
     _, _, part, density, grid = observed(scene.samples_of, base)
     data, offsets, rng = part.data, part.offsets, np.random.default_rng(scene.seed)

@@ -46,8 +46,8 @@ def solved(case: Case, base: Path) -> dict:
     """Image a case, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
-    from casa_sara.reconstruction.reconstruct import reconstruct
     from casa_sara.reconstruction.problem import Samples
+    from casa_sara.reconstruction.reconstruct import reconstruct
 
     sky, simulated, part, density, grid = observed(case, base)
     found = reconstruct(Samples(part.data, part.offsets, density, part.noise), grid, SolverOptions(nthreads=1))

@@ -180,6 +180,7 @@ def test_line_is_recovered(solved):
     assert record["outframe"] == "LSRK"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("asked", [1, 140])
 def test_stopped_cube_goes_on_to_the_same_images(line, solved, monkeypatch, asked):
     """Stopped in the fit that comes first (at most 80 steps), or in the iterations of the second channel."""

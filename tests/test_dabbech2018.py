@@ -373,6 +373,7 @@ def vis(tmp_path_factory):
                     scans=3, integration=20.0, spacing_seconds=5400.0, hour_angle=-2.5, seed=4)
 
 
+@pytest.mark.slow
 def test_the_task_images_with_the_paper(vis, tmp_path, caplog):
     from casatasks import casalog
     from simulated_ms import pixels
@@ -400,6 +401,7 @@ def test_the_task_images_with_the_paper(vis, tmp_path, caplog):
     assert "method = 'dabbech2018'" in (tmp_path / "casa.log").read_text()
 
 
+@pytest.mark.slow
 def test_a_cube_is_imaged_channel_by_channel(vis, tmp_path):
     from casa_sara import tsara
 

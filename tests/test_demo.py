@@ -109,6 +109,7 @@ def test_blocks_tell_what_the_measurementset_holds(tmp_path, clean):
         assert block.error**2 == pytest.approx(block.noise**2 + block.gain**2, rel=0.05)
 
 
+@pytest.mark.slow
 def test_noise_is_drawn_anew_for_each_seed_and_measurementset(tmp_path):
     noise = []
     for seed in (1, 2):
@@ -154,6 +155,7 @@ def test_gain_errors_are_antenna_gains_of_each_scan(tmp_path, clean):
     assert all(block.noise == 0 and block.gain == block.error for block in simulation.blocks)
 
 
+@pytest.mark.slow
 def test_pointing_errors_are_gains_that_grow_from_the_centre(tmp_path):
     """Two sources at half the way to the edge: opposite errors, antenna by antenna; one at the centre: none."""
     rms, shape = 0.02, (48, 32)
@@ -187,6 +189,7 @@ def test_scans_of_each_configuration(tmp_path):
     assert [block.scan for block in simulation.blocks] == [1, 2, 3, 1]
 
 
+@pytest.mark.slow
 def test_seed_decides(tmp_path):
     data = []
     for name, db, seed in (("a", 30.0, 1), ("b", 30.0, 1), ("c", 30.0, 2), ("d", 90.0, 1), ("e", 120.0, 1)):

@@ -130,6 +130,7 @@ def test_flags_are_read_before_a_run_is_refused(vis, tmp_path, monkeypatch):
     assert said["fits"] and said["visibilities"] < 0.2 * full
 
 
+@pytest.mark.slow
 def test_time_limit_delivers_the_image(vis, tmp_path):
     """A run that re-weights for ever ends, with its images written."""
     made = tsara(vis=vis, imagename=str(tmp_path / "short"), maxtime="6s", reltol=0.0, reweighttol=0.0,

@@ -80,6 +80,7 @@ def test_report_has_every_section_and_picture(report):
         assert word in page.text
 
 
+@pytest.mark.slow
 def test_a_report_replaces_the_earlier_one_whole(report, tmp_path, monkeypatch):
     """Pictures of the earlier report go, other files stay, and a report that fails changes nothing."""
     few = comparison(names=("one",), with_truth=False)
@@ -102,6 +103,7 @@ def test_a_report_replaces_the_earlier_one_whole(report, tmp_path, monkeypatch):
     assert "tclean natural" not in (tmp_path / "report.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_file_that_is_not_the_reports_is_not_replaced(tmp_path):
     few = comparison(names=("one",), with_truth=False)
     (tmp_path / "zooms.png").write_text("mine")
@@ -124,6 +126,7 @@ def test_report_is_self_contained(report):
     assert not re.search(r"https?://|file:|@import|url\(", page.source)
 
 
+@pytest.mark.slow
 def test_what_comes_from_data_is_escaped(tmp_path):
     made = comparison(names=(EVIL, "other"))
     first = dataclasses.replace(made.products[0], parameters={EVIL: EVIL})
@@ -171,6 +174,7 @@ def test_parts_of_a_record(tmp_path, missing):
     assert not (tmp_path / "n.png").exists()
 
 
+@pytest.mark.slow
 def test_blank_pixels_and_zero_residuals(tmp_path):
     made = comparison(names=("_one", "two"))
     model = made.products[0].model.copy()
@@ -183,6 +187,7 @@ def test_blank_pixels_and_zero_residuals(tmp_path):
     assert write_report(dataclasses.replace(made, products=products[:1]), tmp_path / "hidden_label").exists()
 
 
+@pytest.mark.slow
 def test_pictures_differ_where_the_data_do(tmp_path, full):
     """A source put into the last residual image shows there, in red, at its place, and nowhere else."""
     last = full.products[-1]  # with the largest residuals: the scales, of the median and the least, stay

@@ -265,6 +265,7 @@ def test_truth_is_brought_to_the_same_pixels(tmp_path):
     assert found["truth"]["ssim"] == pytest.approx(metrics.ssim(sky(), model, peak), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_frames_are_animated_in_the_report(tmp_path):
     """The field, and the region that holds emission; each with a frame for each image, in their order."""
     one, *_ = product(tmp_path / "one")
@@ -392,6 +393,7 @@ def deep(tmp_path_factory):
     return name, root
 
 
+@pytest.mark.slow
 def test_an_injected_source_is_recovered(tmp_path, deep):
     """A point of known flux on a pixel of the empty sky, narrower than the beam; CLEAN's is not asked again."""
     vis, root = deep
@@ -636,6 +638,7 @@ def test_parameters_of_the_selection_are_tsaras():
         assert ours[name]._replace(summary="") == theirs[name]._replace(summary=""), name
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(find_spec("casashell") is None, reason="casashell is not installed")
 def test_the_task_in_the_casa_shell(tmp_path):
     product(tmp_path / "one")

@@ -18,6 +18,7 @@ def tutorial():
     return module
 
 
+@pytest.mark.slow
 def test_one_round_recovers_the_gains_and_improves_the_image(tutorial, tmp_path):
     truth, rounds = tutorial.main(tmp_path, scans=3)
     ours, theirs = rounds["tsara"], rounds["tclean"]

@@ -57,6 +57,7 @@ def test_first_image(tmp_path):
     page_agrees("first_image", module.as_text(truth, forecast, result, images).split("\n", 1)[1])
 
 
+@pytest.mark.slow
 def test_cell_and_blocks(tmp_path):
     module = tutorial("cell_and_blocks")
     module.CELLS = (0.25, 0.2)
@@ -75,6 +76,7 @@ def test_cell_and_blocks(tmp_path):
     page_agrees("cell_and_blocks", module.as_text(cells, "", blocks, truth))
 
 
+@pytest.mark.slow
 def test_calibration_quality(tmp_path):
     module = tutorial("calibration_quality")
     before, after, picture = module.main(tmp_path)
@@ -87,6 +89,7 @@ def test_calibration_quality(tmp_path):
     page_agrees("calibration_quality", module.as_text(before, after))
 
 
+@pytest.mark.slow
 def test_compare_with_tclean(tmp_path):
     module = tutorial("compare_with_tclean")
     truth, measures, models = module.main(tmp_path)

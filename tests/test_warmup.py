@@ -110,11 +110,13 @@ def cache(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_what_is_compiled_is_found_and_not_announced(cache):
     said, compiled = eval(output(start(LOADED, cache)))
     assert said == [] and compiled == 0
 
 
+@pytest.mark.slow
 def test_two_processes_leave_each_kernel_once(cache):
     """One file of compiled code for each kernel and signature; the gridding kernels have two widths."""
     code = [path.name.split("-")[0] for path in cache.rglob("*.nbc")]
@@ -123,6 +125,7 @@ def test_two_processes_leave_each_kernel_once(cache):
     assert not list(cache.rglob("*.tmp.*"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mark", ["removed", "of another version"])
 def test_what_is_not_compiled_is_announced(cache, tmp_path, mark):
     shutil.copytree(cache, tmp_path / "numba")
@@ -133,6 +136,7 @@ def test_what_is_not_compiled_is_announced(cache, tmp_path, mark):
     assert path.exists()  # now it is
 
 
+@pytest.mark.slow
 def test_a_helper_that_is_killed_is_made_up_for(cache, tmp_path):
     """Everything but the dictionary is there, and the process that is to compile this is killed: its parent does it."""
     shutil.copytree(cache, tmp_path / "numba")

@@ -213,7 +213,8 @@ def test_check_names_every_stale_file_and_writes_nothing(tmp_path, capsys):
     assert xml2task.main([*command, "--check"]) == 1
     lines = capsys.readouterr().err.splitlines()
     assert [line.split()[1] for line in lines] == [
-        "casa_sara/gotasks/old.py", "casa_sara/gotasks/tiny.py", "casa_sara/private/parameters.py", "casa_sara/tasks/small.py"]
+        "casa_sara/gotasks/old.py", "casa_sara/gotasks/tiny.py", "casa_sara/private/parameters.py",
+        "casa_sara/tasks/small.py"]
     assert (folder / "tasks" / "small.py").read_text() == "# edited\n"
     assert xml2task.main(command) == 0 and xml2task.main([*command, "--check"]) == 0
     assert not (folder / "gotasks" / "old.py").exists()

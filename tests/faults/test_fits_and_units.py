@@ -90,6 +90,7 @@ FORMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS)
 def test_any_form_of_fits_is_start_model_and_mask(vis, form):
     data = block()

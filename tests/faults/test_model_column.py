@@ -75,6 +75,7 @@ def kill_in_child(copy, name, where, last="os.kill(os.getpid(), signal.SIGKILL)"
     killed(KILLED.format(start=start, vis=str(copy), name=str(name), grid=GRID))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where, most_written", [
     ('dies_in(model_column, "_mark", after=True)', None),
     ('dies_in(model_column, "_at_field_centre", 6)', 0.7),
@@ -123,6 +124,7 @@ def test_an_incomplete_column_is_pointed_out_by_the_next_run(copy, tmp_path, mon
     assert any(f"MODEL_DATA of '{copy}' is incomplete" in line for line in said)
 
 
+@pytest.mark.slow
 def test_the_child_ends_with_its_parent(copy, tmp_path):
     """kill -9 of the session alone: nothing goes on writing behind its back."""
     pid = tmp_path / "pid"
@@ -137,6 +139,7 @@ def test_the_child_ends_with_its_parent(copy, tmp_path):
     assert (copy / INCOMPLETE).exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("left", [0, 8_000, 60_000])
 def test_a_disk_that_fills_while_the_column_is_added(vis, uninterrupted, tmp_path, monkeypatch, left):
     """An error that says so, the MeasurementSet as it was; when there is room again, the same session finishes."""
@@ -163,6 +166,7 @@ def test_a_disk_that_fills_while_the_column_is_added(vis, uninterrupted, tmp_pat
         np.testing.assert_array_equal(column(copy, "MODEL_DATA"), model)
 
 
+@pytest.mark.slow
 def test_a_disk_that_is_full_when_the_column_is_due(vis, uninterrupted, tmp_path, monkeypatch):
     """Refused before imaging, and again at the last phase, when the images are whole."""
     model, _ = uninterrupted
@@ -185,6 +189,7 @@ def test_a_disk_that_is_full_when_the_column_is_due(vis, uninterrupted, tmp_path
         np.testing.assert_array_equal(column(copy, "MODEL_DATA"), model)
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_after_the_column_was_added(vis, uninterrupted, tmp_path, monkeypatch):
     """The column is left incomplete, and said to be; when there is room again, the same session finishes it."""
     model, images = uninterrupted

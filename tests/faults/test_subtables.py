@@ -336,6 +336,7 @@ except OSError as error:
 """
 
 
+@pytest.mark.slow
 def test_more_measurement_sets_than_file_handles(vis, tmp_path):
     here = Path(__file__).parent
     code = MANY.format(path=[str(here), str(here.parent)], vis=vis)
