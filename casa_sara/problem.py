@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
+from casa_sara.averaging import Averaged, cell_sides
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
 from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.outliers import find_wild
 from casa_sara.parallel import SERIAL, Serial
@@ -21,6 +24,7 @@ from casa_sara.visibilities import Visibilities
 __all__ = ["Findings", "Problem", "Samples", "first_image"]
 
 ROUNDS = 6  # of leaving out wild samples
+WORTHWHILE = 0.5  # of the samples: where there are more averages than that, the samples are not averaged
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
@@ -90,21 +94,25 @@ class Findings:
 class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
-    `support` is None where all may.
+    `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all `samples`
+    where that is None. `support` is None where all pixels may be non-zero.
     """
 
     samples: Samples
     vis: np.ndarray
+    offsets: np.ndarray
     measurement: Measurement
     precond: np.ndarray
     data_norm_sq: float
     unit_jy: float
     support: np.ndarray | None = None
+    averaged: Averaged | None = None
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions, unit_jy: float, eps: float,
-           data_norm_sq: float | None = None, support: np.ndarray | None = None, comm: Serial = SERIAL) -> Problem:
-        """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`.
+           data_norm_sq: float | None = None, support: np.ndarray | None = None, finer: np.ndarray | None = None,
+           comm: Serial = SERIAL) -> Problem:
+        """Whiten the data, average them, and build their operator, to the accuracy `eps`, for images in `unit_jy`.
 
         Its norm is measured unless given.
 
@@ -120,6 +128,8 @@ class Problem:
         data_norm_sq : float, optional
             ‖U^½Φ‖².
         support : bool (nx, ny), optional
+        finer : int (d,), optional
+            How many times the cells of each block's averages are halved.
         comm : casa_sara.parallel.Serial or MPI
             Over whose ranks the samples are spread.
 
@@ -127,18 +137,34 @@ class Problem:
         -------
         Problem
         """
-        data = samples.data
-        sqrt_weight = np.sqrt(data.weight)
-        vis = data.vis * sqrt_weight
-        sqrt_weight *= np.float32(unit_jy)
-        measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=sqrt_weight, eps=eps,
-                                   nthreads=options.nthreads, comm=comm)
+        data, root_weight = samples.data, np.sqrt(samples.data.weight)
+        operator = partial(sky_operator, grid=grid, eps=eps, nthreads=options.nthreads, comm=comm)
+        vis, offsets = data.vis * root_weight, samples.offsets
+        measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy))
         precond = _preconditioner(samples, options.precondition, comm)
+        averaged = None
+        if options.averages:
+            averaged, uvw, freq_hz = Averaged.of(data, offsets, _cell_sides(grid), finer, vis, measurement, comm)
+            if comm.total(averaged.cells.size) > WORTHWHILE * comm.total(data.size):
+                averaged = None
+        if averaged is not None:
+            vis, offsets = averaged.whitened_mean(vis), averaged.cells.offsets
+            precond = averaged.weighted_mean(precond).astype(np.float32)
+            root_weight = np.sqrt(averaged.sum_of_weights, dtype=np.float32, casting="same_kind")
+            measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy))
+        problem = cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged)
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
-            data_norm_sq = comm.broadcast(power_method(
+            problem.data_norm_sq = comm.broadcast(power_method(
                 lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32))
-        return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support)
+        return problem
+
+
+def _cell_sides(grid):
+    """The sides of cells within which the samples are averaged for this image."""
+    index = 0.0 if grid.spectrum is None else float(np.abs(grid.spectrum.index).max())
+    depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
+    return cell_sides(grid.shape, grid.cell_rad, depth, index)
 
 
 def first_image(samples: Samples, problem_of: Callable[..., Problem], options: SolverOptions,
@@ -171,6 +197,8 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                                positivity=options.positivity, stopped=stopped, support=problem.support)
         samples = problem.samples
+        if problem.averaged is not None:
+            residual = problem.averaged.residual(first)
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
         if comm.total(found.index.size) == 0:

@@ -205,13 +205,15 @@ class _Solution:
         if options.method == PAPER:
             ppd = paper_iteration(problem, dictionary, found.data_norm_sq, options.positivity)
         else:
-            ppd = AdaptivePPD(measurement, dictionary, problem.vis, samples.offsets, problem.precond,
+            ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=crew.comm)
-        ppd.unit_jy = problem.unit_jy
+        ppd.unit_jy, ppd.averaged = problem.unit_jy, problem.averaged
+        ppd.samples = crew.comm.place(np.diff(samples.offsets))[1]
         if problem.support is not None:
             ppd.confine(problem.support)
         weights = samples.data.weight * np.float32(problem.unit_jy**2)
-        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, samples.noise, options))
+        weight_sums = crew.comm.block_sums(weights, samples.offsets)
+        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weight_sums, samples.noise, options))
 
     def state(self, stage, layout, crew):
         """Return, on rank 0, all that :func:`_resume` needs beside the data and the parameters, as one rank alone has it."""
@@ -260,6 +262,7 @@ def _resume(samples, layout, problem_of, options, checkpoint, crew):
         solution.ppd.set_state(ppd)
         solution.bounds.set_state(state["bounds"])
         solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
+        solution.ppd.renew_averages(solution.stage.previous)
     return solution
 
 
@@ -327,11 +330,10 @@ def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
                     options.reltol, options.finalreltol, significance=options.significance)
 
 
-def _bounds(ppd, nnls_norms, weights, noise, options):
-    samples = ppd.block_sizes
+def _bounds(ppd, nnls_norms, weight_sums, noise, options):
+    samples = ppd.samples
     if options.method == PAPER:
-        return paper_bounds(ppd, nnls_norms, weights, options)
-    weight_sums = ppd.comm.block_sums(weights, ppd.offsets)
+        return paper_bounds(ppd, nnls_norms, weight_sums, options)
     common = dict(samples=samples, weight_sums=weight_sums, n_bases=ppd.dictionary.n_bases, regscale=options.regscale)
     if options.databound == "weights":
         return GivenBounds(chi_square_bounds(samples), **common)

@@ -129,7 +129,7 @@ def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: 
     if pace and (line := pace(ppd.iteration - begun)):
         log.info(line)
     fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-    progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.block_sizes.sum()):.4g}, "
+    progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.samples.sum()):.4g}, "
              f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
              f"{record.reweighting[-1]} re-weightings", fraction)
 
