@@ -180,6 +180,8 @@ class Averaged:
         Over whose ranks the samples are spread.
     sum_of_weights : float64 (cells,)
         W.
+    samples : int (d,)
+        How many samples each block has, on all ranks.
     """
 
     cells: Cells
@@ -192,6 +194,7 @@ class Averaged:
 
     def __post_init__(self):
         self.sum_of_weights = self.cells.sums(self.weight)
+        self.samples = self.comm.place(np.diff(self.offsets))[1]
 
     @classmethod
     def of(cls, data: Visibilities, offsets: np.ndarray, sides: np.ndarray, finer: np.ndarray | None, vis: np.ndarray,
@@ -286,22 +289,22 @@ class Averaged:
         predicted += mean
         return np.maximum(self.comm.sum(_powers(residual, self.offsets) - _powers(mean, self.cells.offsets)), 0)
 
-    def error(self, model: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    def error(self, residual: np.ndarray, of_averages: np.ndarray) -> np.ndarray:
         """Return how wrong Φ̄ is for a model: the rms, in each block, of Φ̄x less the average of Φx.
 
         Parameters
         ----------
-        model : real (nx, ny)
-            x.
-        predicted : complex (cells,)
-            Φ̄x.
+        residual : complex (M,)
+            y − Φx.
+        of_averages : complex (cells,)
+            ȳ − Φ̄x, with the averages ȳ of y.
 
         Returns
         -------
         float64 (d,)
             Of real and imaginary parts, whitened: in units of what the MS weights say of the noise of an average.
         """
-        wrong = predicted - self.whitened_mean(self.operator.forward(model))
+        wrong = self.whitened_mean(residual) - of_averages
         powers, cells = self.comm.sum(np.array([_powers(wrong, self.cells.offsets), np.diff(self.cells.offsets)]))
         return np.sqrt(powers / (2 * np.maximum(cells, 1)))
 

@@ -21,10 +21,12 @@ from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import nnls
 from casa_sara.visibilities import Visibilities
 
-__all__ = ["Findings", "Problem", "Samples", "first_image"]
+__all__ = ["Findings", "Problem", "Samples", "averaging_cell", "first_image"]
 
 ROUNDS = 6  # of leaving out wild samples
 WORTHWHILE = 0.5  # of the samples: where there are more averages than that, the samples are not averaged
+LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
+LEAST_NOISE = 1e-6  # of the rms of the visibilities: what the operator is accurate to
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
@@ -79,14 +81,17 @@ class Samples:
 class Findings:
     """What is found before the first iteration.
 
-    `left_out` (n,) are the numbers of the wild samples in the data given; the others are as in `Reconstruction`, in
-    the units of the iteration.
+    `left_out` (n,) are the numbers of the wild samples in the data given; `finer` (d,) is how often the cells are halved within
+    which each block is averaged, and `averaging_error` the largest error of the averages of the first image, in units of their
+    noise; the others are as in `Reconstruction`, in the units of the iteration.
     """
 
     left_out: np.ndarray
     wild: list[dict]
     nnls_norms: np.ndarray
     data_norm_sq: float
+    finer: np.ndarray
+    averaging_error: float = 0.0
     noise_only: bool = False
 
 
@@ -144,7 +149,7 @@ class Problem:
         precond = _preconditioner(samples, options.precondition, comm)
         averaged = None
         if options.averages:
-            averaged, uvw, freq_hz = Averaged.of(data, offsets, _cell_sides(grid), finer, vis, measurement, comm)
+            averaged, uvw, freq_hz = Averaged.of(data, offsets, averaging_cell(grid), finer, vis, measurement, comm)
             if comm.total(averaged.cells.size) > WORTHWHILE * comm.total(data.size):
                 averaged = None
         if averaged is not None:
@@ -160,8 +165,8 @@ class Problem:
         return problem
 
 
-def _cell_sides(grid):
-    """The sides of cells within which the samples are averaged for this image."""
+def averaging_cell(grid: ImageGrid) -> np.ndarray:
+    """Return the sides of the cells within which samples are averaged for an image: :func:`casa_sara.averaging.cell_sides`."""
     index = 0.0 if grid.spectrum is None else float(np.abs(grid.spectrum.index).max())
     depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
     return cell_sides(grid.shape, grid.cell_rad, depth, index)
@@ -192,24 +197,49 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         In `problem.unit_jy`.
     """
     everything, wild, layout = samples.data.size, [], Layout(samples.offsets, comm)
-    problem = problem_of(samples)
+    finer = np.zeros(len(samples.offsets) - 1, int)
+    problem, error = problem_of(samples), np.zeros(1)
     for _ in range(ROUNDS):
-        first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
-                               positivity=options.positivity, stopped=stopped, support=problem.support)
+        first, left = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
+                           positivity=options.positivity, stopped=stopped, support=problem.support)
         samples = problem.samples
-        if problem.averaged is not None:
-            residual = problem.averaged.residual(first)
+        residual = left if problem.averaged is None else problem.averaged.residual(first)
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
-        if comm.total(found.index.size) == 0:
-            break
-        wild += _told_of_all(found, samples, layout, comm)
-        problem, residual = problem_of(samples.without(found.index)), np.delete(residual, found.index)
-    samples = problem.samples
+        if comm.total(found.index.size):
+            wild += _told_of_all(found, samples, layout, comm)
+            samples, residual = samples.without(found.index), np.delete(residual, found.index)
+        else:
+            error = _averaging_error(problem, residual, left, comm)
+            if error.max() <= LARGEST_ERROR:
+                break
+            # it goes with the square of the side
+            finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
+        problem = problem_of(samples, finer=finer)
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
-    nnls_norms = comm.norms(np.array([np.linalg.norm(residual[a:b])
-                                      for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]))
-    return problem, Findings(left_out, wild, nnls_norms, problem.data_norm_sq), first
+    found = Findings(left_out, wild, _norms(residual, samples.offsets, comm), problem.data_norm_sq, finer, float(error.max()))
+    return problem, found, first
+
+
+def _norms(vis, offsets, comm):
+    """Return the norm of each block, of all ranks."""
+    return comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in zip(offsets[:-1], offsets[1:])]))
+
+
+def _averaging_error(problem, residual, of_averages, comm):
+    """Return the error of the averages of an image in each block, float (d,), in units of their noise.
+
+    That is the noise measured in the data; where it is unknown, what the image leaves.  It is not taken for less than the
+    operator is accurate to, in single precision.
+    """
+    samples, averaged = problem.samples, problem.averaged
+    if averaged is None:
+        return np.zeros(len(samples.offsets) - 1)
+    noise = _norms(residual, samples.offsets, comm) / np.sqrt(2 * np.maximum(averaged.samples, 1))
+    if samples.noise is not None:
+        noise = np.where(np.isfinite(samples.noise), samples.noise, noise)
+    least = LEAST_NOISE * _norms(averaged.vis, samples.offsets, comm) / np.sqrt(np.maximum(averaged.samples, 1))
+    return averaged.error(residual, of_averages) / np.maximum(noise, np.maximum(least, np.finfo(float).tiny))
 
 
 def _told_of_all(found, samples, layout, comm):

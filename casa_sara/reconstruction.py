@@ -13,7 +13,7 @@ from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.papermethod import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
 from casa_sara.parallel import SERIAL, Serial
-from casa_sara.problem import Findings, Problem, Samples, first_image
+from casa_sara.problem import Findings, Problem, Samples, averaging_cell, first_image
 from casa_sara.sharing import ALONE, Crew, Layout
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
@@ -46,11 +46,14 @@ class Control:
     checkpoint : Checkpoint, optional
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
         whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
+    tell : callable
+        Takes a line for the log.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
     stopped: Callable[[], bool] = lambda: False
     checkpoint: Checkpoint | None = None
+    tell: Callable[[str], None] = lambda line: None
 
 
 @dataclass
@@ -76,6 +79,9 @@ class Reconstruction:
         Samples that were used, numbers into the data given.
     wild : list of dict
         The others, named: see :class:`casa_sara.outliers.WildSamples`.
+    averaging : dict
+        `averages` to which these samples were averaged, `cell_wavelengths` (u, v) of the largest uv cells, `halvings` of each
+        block's, and the `largest_error` of the averages of the first image in units of their noise; empty where they were not.
     """
 
     model: np.ndarray
@@ -88,6 +94,7 @@ class Reconstruction:
     noise_jy_per_beam: float
     kept: np.ndarray
     wild: list[dict]
+    averaging: dict
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -135,8 +142,32 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         solution = _begin(samples, problem_of, options, startmodel, control.stopped, crew)
         if control.stopped():
             control = replace(control, checkpoint=None)
+    averaging = _averaging(solution, averaging_cell(grid))
+    control.tell(_averaging_words(solution.ppd, averaging, options, averaging_cell(grid)))
     record = _iterate(solution, options, control, layout, crew)
-    return _result(solution, record, samples, comm)
+    return _result(solution, record, samples, averaging, comm)
+
+
+def _averaging(solution, sides):
+    """Return what is kept of the averaging, as of `Reconstruction`."""
+    ppd, found = solution.ppd, solution.found
+    if ppd.averaged is None:
+        return {}
+    return dict(averages=int(ppd.block_sizes.sum()), cell_wavelengths=[float(sides[1]), float(sides[0])],
+                halvings=found.finer.tolist(), largest_error=found.averaging_error)
+
+
+def _averaging_words(ppd, averaging, options, sides):
+    """Return the line of the log on it."""
+    cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
+    if averaging:
+        halved = max(averaging["halvings"])
+        return (f"{ppd.samples.sum()} visibilities are averaged to {averaging['averages']}, within each block and {cell}"
+                + (f", or up to {2**halved} times smaller" if halved else "") + ": the averages of the first image are wrong by "
+                f"up to {averaging['largest_error']:.2g} of their noise, which is put right for each re-weighting")
+    if options.averages:
+        return f"visibilities are not averaged: more than half of them would be left by {cell}"
+    return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"
 
 
 def _identify(checkpoint, samples, layout, grid, support, comm):
@@ -173,7 +204,7 @@ def _keep(solution, checkpoint, layout, crew, stage, now):
         comm.once(checkpoint.keep, lambda: state, iteration, now=True)
 
 
-def _result(solution, record, samples, comm):
+def _result(solution, record, samples, averaging, comm):
     """Return what was found, in Jy."""
     found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
     model = comm.own(ppd.model)
@@ -184,7 +215,7 @@ def _result(solution, record, samples, comm):
         model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
-        wild=found.wild)
+        wild=found.wild, averaging=averaging)
 
 
 @dataclass
@@ -254,7 +285,7 @@ def _resume(samples, layout, problem_of, options, checkpoint, crew):
         found = Findings(**{name: np.array(value) if isinstance(value, np.ndarray) else value
                             for name, value in state["found"].items()})
         found.left_out = layout.here(found.left_out)
-        problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq)
+        problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq, finer=found.finer)
         solution = _Solution.of(problem, found, options, crew)
         ppd, kept = state["ppd"], Layout(solution.ppd.offsets, crew.comm)
         ppd |= {name: kept.scatter(ppd[name]) for name in SAMPLE_ARRAYS}

@@ -109,7 +109,7 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
             preparing()
             return bool(crew.comm.lead([pressed() or bool(watch and watch.deadline.near())])[0])
 
-        control = Control(report, stopped, watch.checkpoint if watch else None)
+        control = Control(report, stopped, watch.checkpoint if watch else None, log.info)
         if not (control.checkpoint and control.checkpoint.state is not None):
             progress.prepare("computing the norm of the measurement operator, and the first image by non-negative least squares "
                              f"(NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")

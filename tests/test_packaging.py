@@ -40,8 +40,9 @@ ROOMS = {
     "mpi": {"casa_sara.parallel", "numpy", "mpi4py"},
     "sharing": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
     "balance": {"casa_sara.operators", "casa_sara.sharing", "numpy"},
+    "averaging": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
     "problem": {
-        "casa_sara.operators", "casa_sara.options", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing",
+        "casa_sara.averaging", "casa_sara.operators", "casa_sara.options", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing",
         "casa_sara.solver", "casa_sara.visibilities", "numpy",
     },
     "papermethod": {"casa_sara.operators", "casa_sara.options", "casa_sara.problem", "casa_sara.solver", "numpy"},
@@ -66,7 +67,7 @@ ROOMS = {
     "jsonfile": set(),
 }
 LIBRARY = (
-    "jit", "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions", "outliers", "problem", "papermethod", "operators", "solver",
+    "jit", "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions", "outliers", "averaging", "problem", "papermethod", "operators", "solver",
     "analysis",
 )
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
