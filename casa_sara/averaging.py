@@ -146,7 +146,7 @@ def _owners(row, rows, holds, comm):
     """Return the rank that each cell belongs to: those that hold samples share the rows of cells evenly."""
     holders = np.flatnonzero(comm.gather(holds))
     count = comm.sum(np.bincount(row, minlength=rows).astype(float))
-    before = np.cumsum(count) - count
+    before = np.minimum(np.cumsum(count) - count, count.sum() - 1)  # of rows above the last cell as well
     return holders[(before * (holders.size / count.sum())).astype(int)][row]
 
 
