@@ -16,9 +16,10 @@ import numpy as np
 from casa_sara.parallel import SERIAL, Serial
 from casa_sara.visibilities import Visibilities
 
-__all__ = ["PHASE", "Averaged", "Cells", "cell_sides"]
+__all__ = ["PHASE", "WORTHWHILE", "Averaged", "Cells", "cell_sides"]
 
 PHASE = 0.1  # rad: rms within a full cell, of the phase of a source in the corner of the image
+WORTHWHILE = 0.5  # of the samples: where there are more averages than that, all samples are used
 
 
 def cell_sides(shape: tuple[int, int], cell_rad: Sequence[float], depth: float = 0.0, index: float = 0.0) -> np.ndarray:
@@ -119,15 +120,19 @@ class Cells:
 
 def _numbers(places, sides, offsets, finer, comm):
     """Return the number of each sample's cell, int64 (M,), ordered by block and v first, and the cells along each axis."""
-    block = np.repeat(np.arange(len(offsets) - 1), np.diff(offsets))
-    key, spans = block, []
+    counts, spans = np.diff(offsets), []
+    key = np.repeat(np.arange(counts.size), counts)
     for place, side in zip(places, sides):
-        number = np.floor(np.exp2(finer)[block] / side * place).astype(np.int64)
+        number = np.repeat(np.exp2(finer) / side, counts)
+        number *= place
+        number = np.floor(number, out=number).astype(np.int64)
         least = -comm.largest(int(-number.min(initial=0)))
         spans.append(comm.largest(int(number.max(initial=0))) - least + 1)
-        key = key * spans[-1] + (number - least)
-    if (len(offsets) - 1) * np.prod(spans, dtype=float) > 2.0**62:
-        raise OverflowError(f"{len(offsets) - 1} blocks with {' x '.join(map(str, spans))} cells are too many to be numbered")
+        key *= spans[-1]
+        key += number
+        key -= least
+    if counts.size * np.prod(spans, dtype=float) > 2.0**62:
+        raise OverflowError(f"{counts.size} blocks of {' x '.join(map(str, spans))} cells are too many to be numbered")
     return key, spans
 
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from casa_sara.averaging import Averaged, cell_sides
+from casa_sara.averaging import WORTHWHILE, Averaged, cell_sides
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
 from casa_sara.operators.sky import sky_operator
@@ -24,7 +24,6 @@ from casa_sara.visibilities import Visibilities
 __all__ = ["Findings", "Problem", "Samples", "averaging_cell", "first_image"]
 
 ROUNDS = 6  # of leaving out wild samples
-WORTHWHILE = 0.5  # of the samples: where there are more averages than that, the samples are not averaged
 LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
 LEAST_NOISE = 1e-6  # of the rms of the visibilities: what the operator is accurate to
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less

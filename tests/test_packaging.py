@@ -73,7 +73,7 @@ LIBRARY = (
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}
 ROOMS["warmup"] = {"casa_sara.operators", "casa_sara.solver", "llvmlite", "numba", "numpy"}
-ROOMS["forecast"] = {"casa_sara.operators", "casa_sara.sharing"}
+ROOMS["forecast"] = {"casa_sara.averaging", "casa_sara.operators", "casa_sara.sharing"}
 ROOMS["timing"] = {"casa_sara.reconstruction", *ROOMS["reconstruction"]}
 ROOMS["rehearsal"] = {
     "casa_sara.casa", "casa_sara.forecast", "casa_sara.resources", "casa_sara.timing", "casa_sara.warmup", "numpy", *NUMERICS,
