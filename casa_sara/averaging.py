@@ -1,8 +1,8 @@
 """Averaging of visibilities that an image cannot tell apart, at their centre of mass.
 
-The samples of one block in one cell of the uv plane become one: their weighted mean at their weighted mean (u, v), with the
-sum of their weights.  What moving a sample by δu changes in the visibility of a source at l, exp(2πi δu l), vanishes in the
-mean to first order, as the mean of δu does; what is left is −½(2π)² var(u) l² of the source.
+The samples of one block in one cell of the uv plane become one: their weighted mean at their weighted mean (u, v), with
+the sum of their weights.  What moving a sample by δu changes in the visibility of a source at l, exp(2πi δu l),
+vanishes in the mean to first order, as the mean of δu does; what is left is −½(2π)² var(u) l² of the source.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ WORTHWHILE = 0.5  # of the samples: where there are more averages than that, all
 def cell_sides(shape: tuple[int, int], cell_rad: Sequence[float], depth: float = 0.0, index: float = 0.0) -> np.ndarray:
     """Sides of the cells along v, u, w and ln ν.
 
-    A full cell has the variance side²/12 along each axis.  The sides along u and v give a source in the corner of the image,
-    half its width away from the centre along both axes, a phase of rms `PHASE`; w and ln ν may each change its visibilities by
-    as much as u or v alone.
+    A full cell has the variance side²/12 along each axis.  The sides along u and v give a source in the corner of the
+    image, half its width away from the centre along both axes, a phase of rms `PHASE`; w and ln ν may each change its
+    visibilities by as much as u or v alone.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class Cells:
 
 
 def _numbers(places, sides, offsets, finer, comm):
-    """Return the number of each sample's cell, int64 (M,), ordered by block and v first, and the cells along each axis."""
+    """Return the number of each sample's cell, int64 (M,), by block and v first, and the cells along each axis."""
     counts, spans = np.diff(offsets), []
     key = np.repeat(np.arange(counts.size), counts)
     for place, side in zip(places, sides):
@@ -159,14 +159,14 @@ def _owners(row, rows, holds, comm):
 class Averaged:
     """The averages of whitened samples y = √w·V, and what links them to all samples.
 
-    They are whitened as well, √W times the mean with W = Σw, so that the average of noise has the variance of one sample.
-    Where a model has the same visibility for all samples of a cell,
+    They are whitened as well, √W times the mean with W = Σw, so that the average of noise has the variance of one
+    sample.  Where a model has the same visibility for all samples of a cell,
 
         ‖y − Φx‖² = ‖ȳ − Φ̄x‖² + scatter,      scatter = Σ|r|² − Σ|r̄|²   for r = y − Φx,
 
-    and Φ†UΦ = Φ̄†ŪΦ̄ with Ū the weighted mean of U.  It has nearly the same, and :meth:`renew` therefore averages residuals:
-    ȳ = Φ̄x + r̄ for the model at hand leaves what that model leaves, without any error, and its scatter is exact.  For
-    another model Φ̄ is wrong by what it makes of the difference of the two.
+    and Φ†UΦ = Φ̄†ŪΦ̄ with Ū the weighted mean of U.  It has nearly the same, and :meth:`renew` therefore averages
+    residuals: ȳ = Φ̄x + r̄ for the model at hand leaves what that model leaves, without any error, and its scatter is
+    exact.  For another model Φ̄ is wrong by what it makes of the difference of the two.
 
     Attributes
     ----------
@@ -316,4 +316,4 @@ class Averaged:
 
 def _powers(vis, offsets):
     """Return ‖·‖² of each block, float64 (d,)."""
-    return np.array([np.linalg.norm(vis[start:stop].astype(complex)) ** 2 for start, stop in zip(offsets[:-1], offsets[1:])])
+    return np.array([np.square(np.abs(vis[a:b]), dtype=float).sum() for a, b in zip(offsets[:-1], offsets[1:])])

@@ -118,7 +118,8 @@ class Workload:
         with_solver = with_operator | self._solver()
         iterating = with_solver | {
             "image planes": self._planes(PLANE + SOLVING + MATCHED * self.confined),
-            "re-weighting": (RENEWING if self.averages else PASSING) * self.samples, "wavelet duals and weights": self.duals * coefs,
+            "re-weighting": (RENEWING if self.averages else PASSING) * self.samples,
+            "wavelet duals and weights": self.duals * coefs,
             "wavelet workspace": workspace}
         phases = {}
         if self.precondition:

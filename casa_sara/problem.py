@@ -80,9 +80,9 @@ class Samples:
 class Findings:
     """What is found before the first iteration.
 
-    `left_out` (n,) are the numbers of the wild samples in the data given; `finer` (d,) is how often the cells are halved within
-    which each block is averaged, and `averaging_error` the largest error of the averages of the first image, in units of their
-    noise; the others are as in `Reconstruction`, in the units of the iteration.
+    `left_out` (n,) are the numbers of the wild samples in the data given; `finer` (d,) is how often the cells are
+    halved within which each block is averaged, and `averaging_error` the largest error of the averages of the first image, in
+    units of their noise; the others are as in `Reconstruction`, in the units of the iteration.
     """
 
     left_out: np.ndarray
@@ -98,8 +98,8 @@ class Findings:
 class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
-    `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all `samples`
-    where that is None. `support` is None where all pixels may be non-zero.
+    `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
+    `samples` where that is None. `support` is None where all pixels may be non-zero.
     """
 
     samples: Samples
@@ -165,7 +165,18 @@ class Problem:
 
 
 def averaging_cell(grid: ImageGrid) -> np.ndarray:
-    """Return the sides of the cells within which samples are averaged for an image: :func:`casa_sara.averaging.cell_sides`."""
+    """Return the sides of the cells within which samples are averaged: :func:`casa_sara.averaging.cell_sides`.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+        Image for which they are averaged.
+
+    Returns
+    -------
+    float (4,)
+        Along v, u, w and ln ν.
+    """
     index = 0.0 if grid.spectrum is None else float(np.abs(grid.spectrum.index).max())
     depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
     return cell_sides(grid.shape, grid.cell_rad, depth, index)
@@ -216,8 +227,8 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
             finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
         problem = problem_of(samples, finer=finer)
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
-    found = Findings(left_out, wild, _norms(residual, samples.offsets, comm), problem.data_norm_sq, finer, float(error.max()))
-    return problem, found, first
+    norms = _norms(residual, samples.offsets, comm)
+    return problem, Findings(left_out, wild, norms, problem.data_norm_sq, finer, float(error.max())), first
 
 
 def _norms(vis, offsets, comm):
@@ -228,8 +239,8 @@ def _norms(vis, offsets, comm):
 def _averaging_error(problem, residual, of_averages, comm):
     """Return the error of the averages of an image in each block, float (d,), in units of their noise.
 
-    That is the noise measured in the data; where it is unknown, what the image leaves.  It is not taken for less than the
-    operator is accurate to, in single precision.
+    That is the noise measured in the data; where it is unknown, what the image leaves.  It is not taken for less than
+    the operator is accurate to, in single precision.
     """
     samples, averaged = problem.samples, problem.averaged
     if averaged is None:

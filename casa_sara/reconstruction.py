@@ -80,8 +80,9 @@ class Reconstruction:
     wild : list of dict
         The others, named: see :class:`casa_sara.outliers.WildSamples`.
     averaging : dict
-        `averages` to which these samples were averaged, `cell_wavelengths` (u, v) of the largest uv cells, `halvings` of each
-        block's, and the `largest_error` of the averages of the first image in units of their noise; empty where they were not.
+        `averages` to which these samples were averaged, `cell_wavelengths` (u, v) of the largest uv cells, `halvings`
+        of each block's, and the `largest_error` of the averages of the first image in units of their noise; empty where
+        they were not.
     """
 
     model: np.ndarray
@@ -161,10 +162,10 @@ def _averaging_words(ppd, averaging, options, sides):
     """Return the line of the log on it."""
     cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
     if averaging:
-        halved = max(averaging["halvings"])
+        smaller = 2 ** max(averaging["halvings"])
         return (f"{ppd.samples.sum()} visibilities are averaged to {averaging['averages']}, within each block and {cell}"
-                + (f", or up to {2**halved} times smaller" if halved else "") + ": the averages of the first image are wrong by "
-                f"up to {averaging['largest_error']:.2g} of their noise, which is put right for each re-weighting")
+                f"{f', or up to {smaller} times smaller' if smaller > 1 else ''}: the averages of the first image are wrong "
+                f"by up to {averaging['largest_error']:.2g} of their noise, which is put right at every re-weighting")
     if options.averages:
         return f"visibilities are not averaged: more than half of them would be left by {cell}"
     return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"

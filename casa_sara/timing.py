@@ -63,7 +63,8 @@ class Timing:
         """Seconds of the run."""
         if not self.iterations:
             return STARTING + self.reading + self.channels * (self.building + self.writing)
-        solving = (self.iterations + REWEIGHTING * self.reweightings) * self.iteration + self.reweightings * self.renewal
+        reweighting = REWEIGHTING * self.iteration + self.renewal
+        solving = self.iterations * self.iteration + self.reweightings * reweighting
         first = NORM_PAIRS * self.pair + self.nnls_iterations * self.nnls_iteration
         return STARTING + self.reading + self.channels * (self.building + first + solving + self.writing)
 
@@ -96,7 +97,8 @@ def measure(data, offsets, grid, options, reading):
     building = time.perf_counter() - start
     image, measurement = np.ones(grid.shape, np.float32), problem.measurement
     pair = _seconds(lambda: measurement.adjoint(measurement.forward(image)))
-    first = _seconds(lambda: nnls(measurement, problem.vis, problem.precond, bound, max_iter=2)) / 2.5  # and a Φ at the end
+    # two iterations, and one Φ of the last image
+    first = _seconds(lambda: nnls(measurement, problem.vis, problem.precond, bound, max_iter=2)) / 2.5
     dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
     if options.method == PAPER:
         dictionary = paper_prior(dictionary, measurement)

@@ -15,20 +15,22 @@ from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.visibilities import sort_into_blocks
 
 GRID = ImageGrid((48, 40), (1e-6, 1e-6))
-WIDE = ImageGrid((48, 40), (1e-3, 1e-3), gridder="wproject", spectrum=Spectrum(np.linspace(-2, 1, 48 * 40).reshape(48, 40), 1e9))
+INDEX = np.linspace(-2, 1, 48 * 40).reshape(48, 40)
+WIDE = ImageGrid((48, 40), (1e-3, 1e-3), gridder="wproject", spectrum=Spectrum(INDEX, 1e9))
 OPTIONS = SolverOptions(wavelets=("dirac", "db1", "db3"), wavelevels=2, significance=0, reltol=1e-6, finalreltol=1e-8)
-SOURCES = {(24, 20): 1.0, (3, 3): 0.7, (44, 4): 0.5, (4, 36): 0.6, (43, 35): 0.8}  # pixel: Jy; the centre and the corners
+SOURCES = {(24, 20): 1.0, (3, 3): 0.7, (44, 4): 0.5, (4, 36): 0.6, (43, 35): 0.8}  # pixel: Jy; centre and corners
 
 
 def tracks(integrations=150, longest=2e5, seed=0):
-    """Samples of 40 baselines, two channels and two scans, with the time and uvw of an Earth that turns, in two blocks."""
+    """Samples of 40 baselines, two channels and two scans, each a block, with the uvw of an Earth that turns."""
     data = observation([(0, 0, k, 3600.0 * k, integrations) for k in range(2)], 40, channels=2, seed=seed)
     rng = np.random.default_rng(seed)
     baseline = (data.rows.antenna2 - 1)[data.row]
     length, angle = longest * np.sqrt(rng.uniform(0.01, 1, 40)), rng.uniform(0, 2 * np.pi, 40)
     turned = angle[baseline] + 2 * np.pi * data.rows.time[data.row] / 86164
     data.freq_hz = (1e9 * (1 + 0.2 * data.chan)).astype(np.float32)
-    data.uvw[:] = length[baseline] * data.freq_hz / 1e9 * np.array([np.cos(turned), 0.7 * np.sin(turned), 0.3 * np.cos(turned)])
+    data.uvw[:] = np.array([np.cos(turned), 0.7 * np.sin(turned), 0.3 * np.cos(turned)])
+    data.uvw *= length[baseline] * data.freq_hz / 1e9
     return sort_into_blocks(data, data.rows.scan[data.row])
 
 
@@ -83,8 +85,8 @@ def observed(noise_db, seed=0):
 def test_cells_are_those_of_blocks_and_of_a_lattice(seed):
     """Against a dictionary of what is in each cell, in the order of their blocks."""
     rng = np.random.default_rng(seed)
-    places, offsets, finer = [rng.uniform(0, 7, 500), rng.normal(0, 3, 500)], np.array([0, 180, 180, 500]), np.array([0, 1, 2])
-    sides, values = [1.1, 0.8], rng.normal(size=500)
+    places, sides, values = [rng.uniform(0, 7, 500), rng.normal(0, 3, 500)], [1.1, 0.8], rng.normal(size=500)
+    offsets, finer = np.array([0, 180, 180, 500]), np.array([0, 1, 2])
     cells = Cells(places, sides, offsets, finer)
     expected = {}
     for block, (start, stop) in enumerate(zip(offsets[:-1], offsets[1:])):
@@ -94,7 +96,8 @@ def test_cells_are_those_of_blocks_and_of_a_lattice(seed):
     blocks = np.array(sorted(key[0] for key in expected))
     assert cells.size == len(expected) < 500
     np.testing.assert_array_equal(cells.offsets, np.searchsorted(blocks, np.arange(4)))
-    np.testing.assert_allclose(cells.sums(values), [values[expected[key]].sum() for key in sorted(expected)], rtol=1e-12, atol=1e-12)
+    sums = [values[expected[key]].sum() for key in sorted(expected)]
+    np.testing.assert_allclose(cells.sums(values), sums, rtol=1e-12, atol=1e-12)
 
 
 def test_a_full_cell_turns_a_source_in_the_corner_by_the_phase_that_is_said():
@@ -119,8 +122,8 @@ def test_averages_are_weighted_means_at_weighted_means():
     found, uvw, _ = averaged(data, offsets)
     sign = np.where(data.uvw[1] < 0, -1, 1)
     sides = averaging_cell(GRID)
-    key = np.column_stack([data.rows.scan[data.row], *(np.floor(sign * data.uvw[axis] / sides[1 - axis]) for axis in (1, 0))])
-    _, inverse = np.unique(key, axis=0, return_inverse=True)
+    places = [np.floor(sign * data.uvw[axis] / sides[1 - axis]) for axis in (1, 0)]
+    _, inverse = np.unique(np.column_stack([data.rows.scan[data.row], *places]), axis=0, return_inverse=True)
     inverse = inverse.reshape(-1)
     weight, vis = data.weight.astype(float), np.where(sign < 0, data.vis.conj(), data.vis)
     total = np.bincount(inverse, weight)
@@ -152,7 +155,7 @@ def test_what_averages_are_wrong_by_is_of_second_order():
 
 
 def test_chi_square_is_that_of_all_samples():
-    """‖y − Φx‖² of the model for which averages are made exactly, and of others nearly; of bright sources beside the noise."""
+    """‖y − Φx‖² exactly of the model for which averages are made, nearly of others; the sources are bright."""
     data, offsets = tracks()
     data.freq_hz = None
     rng = np.random.default_rng(1)
@@ -161,22 +164,26 @@ def test_chi_square_is_that_of_all_samples():
     found, uvw, _ = averaged(data, offsets)
     operator = Explicit(uvw, found.sum_of_weights)
 
-    def powers(vis, offsets):
+    cells = found.cells.offsets
+
+    def of_samples(vis):
         return np.array([np.sum(np.abs(vis[a:b]) ** 2) for a, b in zip(offsets[:-1], offsets[1:])])
+
+    def of_averages(vis):
+        return np.array([np.sum(np.abs(vis[a:b]) ** 2) for a, b in zip(cells[:-1], cells[1:])])
 
     near = 0.97 * sky
     vis = operator.forward(near)
     scatter = found.renew(near, vis)
     for model, tolerance in ((near, 1e-9), (sky, 2e-3), (0.9 * sky, 5e-3)):
-        all_samples = powers(found.residual(model), offsets)
-        np.testing.assert_allclose(powers(vis - operator.forward(model), found.cells.offsets) + scatter, all_samples, rtol=tolerance)
+        left = of_averages(vis - operator.forward(model)) + scatter
+        np.testing.assert_allclose(left, of_samples(found.residual(model)), rtol=tolerance)
     # averages of the data themselves leave what the sources change within the cells to the scatter
-    raw = found.whitened_mean(found.vis)
-    plain = powers(found.vis, offsets) - powers(raw, found.cells.offsets)
-    assert np.all(powers(raw - operator.forward(near), found.cells.offsets) + plain > 1.5 * powers(found.residual(near), offsets))
-    with_error = found.error(found.residual(near), raw - operator.forward(near))
-    exact = found.whitened_mean(found.operator.forward(near)) - operator.forward(near)
-    np.testing.assert_allclose(with_error, np.sqrt(powers(exact, found.cells.offsets) / (2 * np.diff(found.cells.offsets))))
+    raw, predicted = found.whitened_mean(found.vis), operator.forward(near)
+    plain = of_samples(found.vis) - of_averages(raw)
+    assert np.all(of_averages(raw - predicted) + plain > 1.5 * of_samples(found.residual(near)))
+    wrong = of_averages(found.whitened_mean(found.operator.forward(near)) - predicted) / np.diff(cells)
+    np.testing.assert_allclose(found.error(found.residual(near), raw - predicted), np.sqrt(wrong / 2))
 
 
 @pytest.mark.parametrize("grid", [GRID, WIDE], ids=["plane", "w-term and spectrum"])
@@ -192,7 +199,7 @@ def test_the_operator_of_averages_is_that_of_all(grid):
     image = np.random.default_rng(3).uniform(0, 1, grid.shape).astype(np.float32)
     predicted, exact = few.measurement.forward(image), few.averaged.whitened_mean(every.measurement.forward(image))
     assert np.linalg.norm(predicted - exact) < 5e-3 * np.linalg.norm(exact)
-    one, other = (problem.measurement.adjoint(problem.precond * problem.measurement.forward(image)) for problem in (every, few))
+    one, other = (each.measurement.adjoint(each.precond * each.measurement.forward(image)) for each in (every, few))
     assert np.linalg.norm(one - other) < 1e-2 * np.linalg.norm(one)
     assert few.data_norm_sq == pytest.approx(every.data_norm_sq, rel=0.02)
 
@@ -203,7 +210,8 @@ def test_cells_respect_w_and_frequency():
     data.uvw[:2] = 10.0
     data.uvw[2] = np.linspace(0, 3e4, data.size)
     flat = replace(WIDE, gridder="standard", spectrum=None)
-    sizes = [averaged(data, offsets, grid)[0].cells.size for grid in (flat, replace(flat, spectrum=WIDE.spectrum), WIDE)]
+    grids = flat, replace(flat, spectrum=WIDE.spectrum), WIDE
+    sizes = [averaged(data, offsets, grid)[0].cells.size for grid in grids]
     assert sizes[0] == 2 and sizes[0] < sizes[1] < sizes[2]
 
 
@@ -215,7 +223,8 @@ def test_the_solution_is_that_of_all_samples_within_a_tenth_of_the_noise(noise_d
     support, different, errors = sky_of(SOURCES) > 0, [], []
     for seed in range(4):
         samples, noise = observed(noise_db, seed)
-        every, few = (reconstruct(samples, GRID, replace(OPTIONS, averaging=on), support=support) for on in (False, True))
+        every = reconstruct(samples, GRID, replace(OPTIONS, averaging=False), support=support)
+        few = reconstruct(samples, GRID, OPTIONS, support=support)
         assert few.averaging["averages"] < 0.2 * samples.data.size and every.averaging == {}
         different.append([(few.model - every.model)[place] / noise for place in SOURCES])
         errors.append([(every.model[place] - flux) / noise for place, flux in SOURCES.items()])
@@ -231,7 +240,8 @@ def test_cells_are_halved_where_the_first_image_is_too_bright_for_them():
     told = []
     found = reconstruct(samples, GRID, replace(OPTIONS, niter=3), control=Control(tell=told.append))
     assert found.averaging["halvings"] == [1, 1] and found.averaging["largest_error"] < 1
-    assert f"24000 visibilities are averaged to {found.averaging['averages']}," in told[0] and "2 times smaller" in told[0]
+    assert f"24000 visibilities are averaged to {found.averaging['averages']}," in told[0]
+    assert "2 times smaller" in told[0]
 
 
 def test_nothing_is_averaged_where_it_is_not_worthwhile_or_not_possible():
@@ -248,7 +258,12 @@ def test_averages_are_renewed_at_every_reweighting(monkeypatch):
     """After the last one the residual norms are those of all samples, to what the model has changed since."""
     samples, _ = observed(60)
     models, renew = [], AdaptivePPD.renew_averages
-    monkeypatch.setattr(AdaptivePPD, "renew_averages", lambda ppd, model: (models.append(model.copy()), renew(ppd, model)))
+
+    def noted(ppd, model):
+        models.append(model.copy())
+        renew(ppd, model)
+
+    monkeypatch.setattr(AdaptivePPD, "renew_averages", noted)
     found = reconstruct(samples, GRID, OPTIONS, support=sky_of(SOURCES) > 0)
     assert len(models) >= len(found.record.reweightings) + 1 > 5
     data = samples.data

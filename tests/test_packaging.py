@@ -42,8 +42,8 @@ ROOMS = {
     "balance": {"casa_sara.operators", "casa_sara.sharing", "numpy"},
     "averaging": {"casa_sara.parallel", "casa_sara.visibilities", "numpy"},
     "problem": {
-        "casa_sara.averaging", "casa_sara.operators", "casa_sara.options", "casa_sara.outliers", "casa_sara.parallel", "casa_sara.sharing",
-        "casa_sara.solver", "casa_sara.visibilities", "numpy",
+        "casa_sara.averaging", "casa_sara.operators", "casa_sara.options", "casa_sara.outliers", "casa_sara.parallel",
+        "casa_sara.sharing", "casa_sara.solver", "casa_sara.visibilities", "numpy",
     },
     "papermethod": {"casa_sara.operators", "casa_sara.options", "casa_sara.problem", "casa_sara.solver", "numpy"},
     "resources": set(),
@@ -67,8 +67,8 @@ ROOMS = {
     "jsonfile": set(),
 }
 LIBRARY = (
-    "jit", "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions", "outliers", "averaging", "problem", "papermethod", "operators", "solver",
-    "analysis",
+    "jit", "options", "parallel", "visibilities", "snapshots", "sharing", "balance", "levels", "noise", "cautions",
+    "outliers", "averaging", "problem", "papermethod", "operators", "solver", "analysis",
 )
 ROOMS["reconstruction"] = {"numpy", *(f"casa_sara.{name}" for name in LIBRARY)}
 NUMERICS = {f"casa_sara.{name}" for name in (*LIBRARY, "reconstruction")}

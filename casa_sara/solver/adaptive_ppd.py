@@ -89,7 +89,8 @@ class AdaptivePPD:
     begins, block_sizes : int (d,)
         How many of a block's samples lie on ranks before this one, and on all.
     averaged : object or None
-        What links the samples to those that they are averages of: `renew(model, predicted)`, see :meth:`renew_averages`.
+        What links averaged samples to those that they are averages of, by `renew(model, predicted)`: see
+        :meth:`renew_averages`.
     samples : int (d,)
         M_j, samples of each block, before they were averaged.
     scatter : float (d,)
@@ -228,7 +229,7 @@ class AdaptivePPD:
         self.measurement.forward(self.model, self._phi_anchor)
 
     def renew_averages(self, model: np.ndarray) -> None:
-        """Where the samples are averages, make them anew so that their residuals of this model, and their scatter, are exact.
+        """Where the samples are averages, make them anew: what they leave of this model, and their scatter, are exact.
 
         Parameters
         ----------
