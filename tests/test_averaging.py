@@ -12,6 +12,8 @@ from casa_sara.options import ImageGrid, SolverOptions, Spectrum
 from casa_sara.problem import Problem, Samples, averaging_cell
 from casa_sara.reconstruction import Control, reconstruct
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.checkpoint import Checkpoint
+from casa_sara.solver.record import STOPPED_BY_USER
 from casa_sara.visibilities import sort_into_blocks
 
 GRID = ImageGrid((48, 40), (1e-6, 1e-6))
@@ -254,19 +256,48 @@ def test_nothing_is_averaged_where_it_is_not_worthwhile_or_not_possible():
     assert "databound = 'weights'" in told[0] and "method = 'dabbech2018'" in told[1] and "more than half" in told[2]
 
 
-def test_averages_are_renewed_at_every_reweighting(monkeypatch):
-    """After the last one the residual norms are those of all samples, to what the model has changed since."""
-    samples, _ = observed(60)
-    models, renew = [], AdaptivePPD.renew_averages
+def norms_of_all(samples, model):
+    """‖y_j − Φ_j x‖ of all samples, by an operator of their own."""
+    left = (samples.data.vis - sky_operator(samples.data.uvw, GRID).forward(model)) * np.sqrt(samples.data.weight)
+    return [np.linalg.norm(left[a:b]) for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]
 
-    def noted(ppd, model):
-        models.append(model.copy())
+
+def test_averages_are_renewed_at_the_beginning_and_at_every_reweighting(monkeypatch):
+    """The residual norms are those of all samples, but for what the model has changed since."""
+    samples, _ = observed(60)
+    times, renew = [], AdaptivePPD.renew_averages
+
+    def counted(ppd, model):
+        times.append(ppd.iteration)
         renew(ppd, model)
 
-    monkeypatch.setattr(AdaptivePPD, "renew_averages", noted)
-    found = reconstruct(samples, GRID, OPTIONS, support=sky_of(SOURCES) > 0)
-    assert len(models) >= len(found.record.reweightings) + 1 > 5
-    data = samples.data
-    left = (data.vis - sky_operator(data.uvw, GRID).forward(found.model)) * np.sqrt(data.weight)
-    exact = [np.linalg.norm(left[a:b]) for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]
-    np.testing.assert_allclose(found.residual_norms, exact, rtol=1e-4)
+    monkeypatch.setattr(AdaptivePPD, "renew_averages", counted)
+    support = sky_of(SOURCES) > 0
+    begun = reconstruct(samples, GRID, replace(OPTIONS, niter=1), support=support)
+    assert times == [0]
+    np.testing.assert_allclose(begun.residual_norms, begun.nnls_norms, rtol=1e-4)  # of the model before the step
+    found = reconstruct(samples, GRID, OPTIONS, support=support)
+    assert {0, *(update["iteration"] for update in found.record.reweightings)} <= set(times[1:]) and len(times) > 5
+    np.testing.assert_allclose(found.residual_norms, norms_of_all(samples, found.model), rtol=1e-4)
+
+
+def test_a_solution_goes_on_with_its_averages(tmp_path):
+    """Stopped before and after a re-weighting, with cells that were halved, it ends at the same image to the last bit."""
+    samples = replace(observed(60)[0], noise=np.ones(2))
+    options, path, reached = replace(OPTIONS, niter=150), str(tmp_path / "c"), [0]
+
+    def run(stop_at=None):
+        checkpoint = Checkpoint(path, "1", {})
+        if stop_at != 50:
+            checkpoint.open()
+        return reconstruct(samples, GRID, options, control=Control(
+            lambda ppd, record: reached.__setitem__(0, ppd.iteration), lambda: reached[0] == stop_at, checkpoint))
+
+    wanted = reconstruct(samples, GRID, options)
+    assert wanted.averaging["halvings"] == [1, 1] and wanted.record.reweightings[0]["iteration"] == 60
+    stopped = [run(stop_at) for stop_at in (50, 70)]
+    assert [one.record.stop_code for one in stopped] == 2 * [STOPPED_BY_USER]
+    found = run()
+    np.testing.assert_array_equal(found.model, wanted.model)
+    np.testing.assert_array_equal(found.residual_norms, wanted.residual_norms)
+    assert found.averaging == wanted.averaging and found.record.resumed == [50, 70]
