@@ -129,6 +129,12 @@ class SolverOptions:
     regscale: float = 1.0
     significance: float = 5.0
     nthreads: int = 1
+    averaging: bool = True  # no task parameter
+
+    @property
+    def averages(self) -> bool:
+        """Whether visibilities are averaged: not for the paper's method, nor for bounds as constraints."""
+        return self.averaging and self.method == "tsara" and self.databound == "adapt"
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,8 @@ def run(**parameters):
                 bounds=[block["l2_bound"] for block in sara["blocks"]], resumed=sara["resumed"],
                 noise=[block["noise_measured"] for block in sara["blocks"]], wild=[one["row"] for one in sara["wild"]],
                 labels=[[block["samples"], block["scans"], block["start_mjd_s"]] for block in sara["blocks"]],
-                dropped=sara["dropped"], residual_norm=list(sara["history"]["residual_norm"]))
+                dropped=sara["dropped"], averages=sara["averaging"].get("averages"),
+                halvings=sara["averaging"].get("halvings"), residual_norm=list(sara["history"]["residual_norm"]))
 
 
 def stopped(**parameters):

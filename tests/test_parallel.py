@@ -115,7 +115,7 @@ def _same_images(one, other, products=("model", "psf")):
 def _same_findings(found, expected, ranks):
     assert sorted(found) == list(range(ranks))
     assert all(found[rank] == found[0] for rank in found)  # the same dictionary on every rank
-    exact = ("iterdone", "stopcode", "visibilities", "wild", "labels", "dropped")
+    exact = ("iterdone", "stopcode", "visibilities", "wild", "labels", "dropped", "averages", "halvings")
     assert {name: found[0][name] for name in exact} == {name: expected[name] for name in exact}
     np.testing.assert_allclose(found[0]["noise"], expected["noise"], rtol=1e-12)
     for name in ("bounds", "residual_norm"):
@@ -148,6 +148,7 @@ def test_two_ranks_find_what_one_process_finds(two, alone, folder):
         _same_findings(said[step], alone[name], 2)
         _same_images(folder / "two" / name, folder / "alone" / name)
     assert alone["whole"]["wild"] == [700] and len(alone["hard"]["bounds"]) == 3
+    assert 0 < alone["whole"]["averages"] < alone["whole"]["visibilities"] / 5 and 0 < alone["rich"]["averages"]
     assert alone["whole"]["stopcode"] == ITERATION_LIMIT
 
 

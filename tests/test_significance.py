@@ -9,6 +9,7 @@ from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.state_file import read, write
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l1_weights import band_noise, first_weights, reweight
+from casa_sara.solver.matched_filter import MatchedFilter
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, STOPPED_BY_USER, STRUCTURED, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, run_algorithm_2
 from casa_sara.solver.significance import SignificantSupport
@@ -194,6 +195,25 @@ def test_the_first_support_holds_what_is_sure_and_the_next_what_is_significant()
                              for snr, place in places.items())
         assert support.begun
     assert inside == [[True, False, False], [True, True, True], [True, True, True]]
+
+
+def test_a_support_is_found_with_the_filter_of_the_present_noise(monkeypatch):
+    """The filter is kept while the noise levels are the same, and made anew when they are not."""
+    sums, ppd, bounds = problem()
+    ppd.vis[:] = sums.whiten * (sums.of((20 * NOISE, 12, 12, 0), (7 * NOISE, 34, 26, 0)) + sums.noise(1))
+    made, support = [], SignificantSupport(5.0)
+    monkeypatch.setattr("casa_sara.solver.significance.MatchedFilter", lambda *of: made.append(1) or MatchedFilter(*of))
+    support.update(ppd, bounds)
+    found = []
+    for noise, filters in (((1.0, 1.0), 1), ((1.0, 1.0), 1), ((2.0, 2.5), 2)):
+        bounds.l2_bounds = np.array(noise) * np.sqrt(2.0 * bounds.samples)
+        support.update(ppd, bounds)
+        assert len(made) == filters
+        found.append(ppd.lowest.copy())
+        SignificantSupport(5.0, begun=True).update(ppd, bounds)
+        np.testing.assert_array_equal(ppd.lowest, found[-1])
+        made.pop()
+    assert not np.array_equal(found[0], found[2])  # 7 σ are not significant any more
 
 
 # ---- the weights within a support

@@ -57,7 +57,7 @@ def test_the_model_is_the_sky(run):
     result, name, *_ = run
     model = pixels(name + ".model")
     assert result["stopcode"] == CONVERGED and result["stopDescription"] == "converged"
-    assert model.min() > -0.02 * model.max()  # beside a bright source the bound may have given way
+    assert model.min() > -0.03 * model.max()  # beside a bright source the bound may have given way
     assert model.sum() == pytest.approx(FLUX, rel=0.03)
     # the brighter point source: flux and place, index = 64 − l/cell, 64 + m/cell
     box = model[84:93, 74:83]
@@ -334,8 +334,9 @@ def test_wild_samples_are_left_out_named_and_counted(run, vis, copy, tmp_path):
             return values
 
         edit(name, column, spoil)
-    tsara(vis=str(flagged), imagename=str(tmp_path / "flagged"), **GRID)
-    result = tsara(vis=str(copy), imagename=str(tmp_path / "wild"), **GRID)
+    some = GRID | dict(niter=85)  # until the support, and what may be negative, are found by thresholds
+    tsara(vis=str(flagged), imagename=str(tmp_path / "flagged"), **some)
+    result = tsara(vis=str(copy), imagename=str(tmp_path / "wild"), **some)
     sara = result["sara"]
     assert sara["dropped"]["wild"] == len(sara["wild"]) == 2
     assert sorted(sample["row"] for sample in sara["wild"]) == [10, 300]
@@ -343,8 +344,8 @@ def test_wild_samples_are_left_out_named_and_counted(run, vis, copy, tmp_path):
     assert {"antenna1", "antenna2", "time_mjd_s", "ms"} <= set(sara["wild"][0])
     model, clean = pixels(str(tmp_path / "wild.model")), pixels(str(tmp_path / "flagged.model"))
     assert np.linalg.norm(model - clean) < 1e-3 * np.linalg.norm(clean)
-    residual, before = (pixels(name + ".residual") for name in (str(tmp_path / "wild"), run[1]))
-    assert residual.std() < 1.1 * before.std()
+    residual, wanted = (pixels(str(tmp_path / f"{name}.residual")) for name in ("wild", "flagged"))
+    assert residual.std() < 1.01 * wanted.std()
     assert sum(block["samples"]
                for block in sara["blocks"]) == run[0]["sara"]["visibilities"] - 2 == sara["visibilities"]
 

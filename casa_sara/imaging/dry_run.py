@@ -123,7 +123,8 @@ def dry_run(selection, grid, options, blocks, limits):
         log.info(line)
     seconds = {name: getattr(timing, name) for name in ("reading", "building", "pair", "nnls_iteration", "iteration",
                                                         "writing", "total")}
-    return found.summary() | {"visibilities": everything, "iterations": timing.iterations, "seconds": seconds,
+    return found.summary() | {"visibilities": everything, "averages": timing.averages,
+                              "iterations": timing.iterations, "seconds": seconds,
                               "iteration_s": timing.iteration}
 
 
@@ -131,7 +132,7 @@ def _time_lines(timing):
     """The times as lines of a table."""
     channels = f" for each of {timing.channels} channels" if timing.channels > 1 else ""
     yield (f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the number depends "
-           "on the data)")
+           "on the data)" + (f", the visibilities averaged to {timing.averages}" if timing.averages else ""))
     rows = {"reading": timing.reading, "building the operator": timing.building,
             "one NNLS iteration": timing.nnls_iteration, "one solver iteration": timing.iteration,
             "writing the images": timing.writing}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from casa_sara.data.averaging import WORTHWHILE
 from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
 from casa_sara.operators.sky import further_bytes
@@ -20,6 +21,10 @@ POINT = 28  # of the operator: NonUniformFFT's Points
 PLANNING = 64  # frequencies and factors, while the operator is built
 SOLVER = 48  # whitened data, density, preconditioner, dual, Φx̄, Φz, weights
 PASSING = 12  # weights of a pass between the iterations
+# where visibilities are averaged; the averages have an operator of their own
+AVERAGED = 16  # of all: whitened, the numbers of their cells, the density
+AVERAGE = 72  # of an average: that of SOLVER, POINT and the sums of its cell
+RENEWING = 24  # of all: residual and its sums
 WEIGHING = 30  # uv cells and densities
 SORTING = 12  # of a cube: channels of the samples, and their order
 CHECKPOINT = 16  # the dual and Φz
@@ -60,6 +65,7 @@ class Workload:
     whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
     confined: bool = False
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
+    averages: bool = False  # visibilities may be averaged
 
     @classmethod
     def of(cls, volume, grid, options, report=False, band=0.0, ranks=ALONE):
@@ -74,7 +80,7 @@ class Workload:
                    masked=grid.masked,
                    whole=(volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
-                   duals=3 if options.method == "dabbech2018" else 2)
+                   duals=3 if options.method == "dabbech2018" else 2, averages=options.averages)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -113,10 +119,11 @@ class Workload:
     def _solving(self, held, with_operator):
         """The phases from the density of the samples to the writing of a checkpoint."""
         coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
-        with_solver = with_operator | {"solver's visibilities": SOLVER * self.samples}
+        with_solver = with_operator | self._solver()
         iterating = with_solver | {
             "image planes": self._planes(PLANE + SOLVING + MATCHED * self.confined),
-            "re-weighting": PASSING * self.samples, "wavelet duals and weights": self.duals * coefs,
+            "re-weighting": (RENEWING if self.averages else PASSING) * self.samples,
+            "wavelet duals and weights": self.duals * coefs,
             "wavelet workspace": workspace}
         phases = {}
         if self.precondition:
@@ -131,6 +138,14 @@ class Workload:
             phases["writing a checkpoint"] = iterating | {
                 "gathered of all ranks": 2 * (CHECKPOINT * samples + duals_and_weights)}
         return phases
+
+    def _solver(self):
+        """What the solver holds of the visibilities: of all of them, or of averages."""
+        if not self.averages:
+            return {"solver's visibilities": SOLVER * self.samples}
+        most = math.ceil(WORTHWHILE * self.samples)
+        return {"solver's visibilities": AVERAGED * self.samples + AVERAGE * most + self._grid()
+                + further_bytes(most, self, self.max_w, self.band)}
 
     def _writing(self, with_operator):
         parts = with_operator | {"while planning": PLANNING * self.samples,

@@ -118,7 +118,7 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
             preparing()
             return bool(ranks.comm.bcast_numbers([pressed() or bool(watch and watch.deadline.near())])[0])
 
-        control = Control(report, stopped, watch.checkpoint if watch else None)
+        control = Control(report, stopped, watch.checkpoint if watch else None, log.info)
         if not (control.checkpoint and control.checkpoint.state is not None):
             progress.prepare("computing the norm of the measurement operator, and the first image by non-negative "
                              f"least squares (NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
@@ -139,7 +139,7 @@ def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: 
     if pace and (line := pace(ppd.iteration - begun)):
         log.info(line)
     fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-    progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.block_sizes.sum()):.4g}, "
+    progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.samples.sum()):.4g}, "
              f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
              f"{record.reweighting[-1]} re-weightings", fraction)
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from casa_sara.data.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
-from casa_sara.operators.sky import sky_operator
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
+from casa_sara.reconstruction.problem import Problem, Samples
 from casa_sara.reconstruction.reconstruct import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.nnls import NNLS_ITERATIONS, NNLSFit, nnls
@@ -39,6 +39,10 @@ class Timing:
         Expected; the data decide.
     channels : int
         Of the image, each of which takes as much.
+    renewal : float
+        Seconds in which averages are made anew, at a re-weighting.
+    averages : int
+        To which the visibilities are averaged, 0 where they are not.
     """
 
     reading: float
@@ -51,13 +55,16 @@ class Timing:
     reweightings: int
     channels: int = 1
     nnls_iterations: int = NNLS_ITERATIONS
+    renewal: float = 0.0
+    averages: int = 0
 
     @property
     def total(self) -> float:
         """Seconds of the run."""
         if not self.iterations:
             return STARTING + self.reading + self.channels * (self.building + self.writing)
-        solving = (self.iterations + REWEIGHTING * self.reweightings) * self.iteration
+        reweighting = REWEIGHTING * self.iteration + self.renewal
+        solving = self.iterations * self.iteration + self.reweightings * reweighting
         first = NORM_PAIRS * self.pair + self.nnls_iterations * self.nnls_iteration
         return STARTING + self.reading + self.channels * (self.building + first + solving + self.writing)
 
@@ -86,25 +93,26 @@ def measure(data, offsets, grid, options, reading):
     if not options.niter:
         return Timing(reading, 0.0, 0.0, 0.0, 0.0, writing, 0, 0)
     start = time.perf_counter()
-    scale = np.sqrt(data.weight)
-    vis = data.vis * scale
     eps = operator_accuracy(data, offsets, noise_from_differences(data, offsets))
-    measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=scale, eps=eps, nthreads=options.nthreads)
-    building = time.perf_counter() - start
-    image, precond = np.ones(grid.shape, np.float32), np.ones(data.size, np.float32)
     bound = float(data.weight.sum(dtype=float)) * math.prod(grid.shape)  # of the operator's squared norm
+    samples = Samples(data, offsets, np.ones(data.size, np.float32))
+    problem = Problem.of(samples, grid, options, unit_jy=1.0, eps=eps, data_norm_sq=bound)
+    building = time.perf_counter() - start
+    image, measurement = np.ones(grid.shape, np.float32), problem.measurement
     pair = _seconds(lambda: measurement.adjoint(measurement.forward(image)))
-    # and one Φ of the last image
-    first = _seconds(lambda: nnls(measurement, vis, precond, bound, NNLSFit(max_iter=2))) / 2.5
+    # two iterations, and one Φ of the last image
+    first = _seconds(lambda: nnls(measurement, problem.vis, problem.precond, bound, NNLSFit(max_iter=2))) / 2.5
     dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
     if options.method == PAPER:
         dictionary = paper_prior(dictionary, measurement)
-    ppd = AdaptivePPD(measurement, dictionary, vis, offsets, precond, bound, options.positivity)
-    ppd.threshold = 1.0
+    ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond, bound, options.positivity)
+    ppd.averaged, ppd.threshold = problem.averaged, 1.0
+    renewal = _seconds(lambda: ppd.renew_averages(ppd.model)) if ppd.averaged else 0.0
     schedule = schedule_of(options)
     of_blocks = schedule.nnls_iterations if options.method == PAPER else 0
     return Timing(reading, building, pair, first, _seconds(ppd.step), writing, schedule.expected_iterations,
-                  schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks)
+                  schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks, renewal=renewal,
+                  averages=ppd.vis.size if ppd.averaged else 0)
 
 
 def _seconds(call, repeats=3):

@@ -172,6 +172,7 @@ def _solution(result, options, full):
         sara["why"] = WHY | (PAPER_WHY if options.method == "dabbech2018" else {})
         sara["resumed"] = list(record.resumed)
         sara["wild"] = [dict(sample) for sample in solved.wild]
+        sara["averaging"] = dict(solved.averaging)
         sara["islands"] = [dict(island) for island in record.islands]
         sara["residual_snr"] = [dict(peak) for peak in record.residual_snr]
         sara["reweightings"] = [dict(update) for update in record.reweightings]

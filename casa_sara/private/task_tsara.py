@@ -262,7 +262,7 @@ def _solver_options(parameters, comm):
     if not parameters["regscale"] > 0:
         raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the automatic weight of the "
                          "prior")
-    names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}
+    names = set(SolverOptions.__dataclass_fields__) - {"nthreads", "averaging"}
     values = {name: tuple(value) if isinstance(value := parameters[name], list) else value for name in names}
     nthreads = min(parameters["nthreads"] or _own_cores(comm), os.cpu_count() or 1)
     return SolverOptions(nthreads=nthreads, **values)

@@ -102,7 +102,7 @@ def paper_iteration(problem: Problem, dictionary: SaraDictionary, data_norm_sq: 
                        positivity, RELAXATION)
 
 
-def paper_bounds(ppd: AdaptivePPD, nnls_norms: np.ndarray, weights: np.ndarray,
+def paper_bounds(ppd: AdaptivePPD, nnls_norms: np.ndarray, weight_sums: np.ndarray,
                  options: SolverOptions) -> PaperBounds:
     """The bounds: adaptive, from NNLS; or fixed, from the MS weights or l2bound, for known noise (section 3).
 
@@ -112,8 +112,8 @@ def paper_bounds(ppd: AdaptivePPD, nnls_norms: np.ndarray, weights: np.ndarray,
         The iteration, whose model is looked at.
     nnls_norms : float (d,)
         μ_j^NNLS.
-    weights : real (M,)
-        Squared row scales, in the unit of the model.
+    weight_sums : float (d,)
+        Sum of the weights of each block, in the unit of the model.
     options : SolverOptions
         Task parameters of the method.
 
@@ -127,7 +127,7 @@ def paper_bounds(ppd: AdaptivePPD, nnls_norms: np.ndarray, weights: np.ndarray,
     else:
         noise = np.broadcast_to(1.0 if options.databound == "weights" else options.l2bound, samples.shape)
         start = chi_square_bounds(samples, noise)
-    return PaperBounds(start, samples, ppd.comm.block_sums(weights, ppd.offsets), adapts)
+    return PaperBounds(start, samples, weight_sums, adapts)
 
 
 def first_threshold(options: SolverOptions, first: np.ndarray) -> float:

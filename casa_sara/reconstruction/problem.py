@@ -3,24 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
+from casa_sara.data.averaging import WORTHWHILE, Averaged, cell_sides
 from casa_sara.data.distribution import Layout
 from casa_sara.data.outliers import find_wild
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
 from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import NNLSFit, nnls
 
-__all__ = ["Findings", "Problem", "Samples", "first_image"]
+__all__ = ["Findings", "Problem", "Samples", "averaging_cell", "first_image"]
 
 ROUNDS = 6  # of leaving out wild samples
+LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
+LEAST_NOISE = 1e-6  # of the rms of the visibilities: what the operator is accurate to
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
@@ -76,14 +82,17 @@ class Samples:
 class Findings:
     """What is found before the first iteration.
 
-    `left_out` (n,) are the numbers of the wild samples in the data given; the others are as in `Reconstruction`, in
-    the units of the iteration.
+    `left_out` (n,) are the numbers of the wild samples in the data given; `finer` (d,) is how often the cells are
+    halved within which each block is averaged, and `averaging_error` the largest error of the averages of the first
+    image, in units of their noise; the others are as in `Reconstruction`, in the units of the iteration.
     """
 
     left_out: np.ndarray
     wild: list[dict]
     nnls_norms: np.ndarray
     data_norm_sq: float
+    finer: np.ndarray
+    averaging_error: float = 0.0
     noise_only: bool = False
 
 
@@ -91,22 +100,25 @@ class Findings:
 class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
-    `support` is None where all may.
+    `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
+    `samples` where that is None. `support` is None where all pixels may be non-zero.
     """
 
     samples: Samples
     vis: np.ndarray
+    offsets: np.ndarray
     measurement: Measurement
     precond: np.ndarray
     data_norm_sq: float
     unit_jy: float
     support: np.ndarray | None = None
+    averaged: Averaged | None = None
 
     @classmethod
-    def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - three have a default
+    def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - four have a default
            unit_jy: float, eps: float, data_norm_sq: float | None = None, support: np.ndarray | None = None,
-           comm: Serial = SERIAL) -> Problem:
-        """Whiten the data and build their operator, to the accuracy `eps`, for images in `unit_jy`.
+           finer: np.ndarray | None = None, comm: Serial = SERIAL) -> Problem:
+        """Whiten the data, average them, and build their operator, to the accuracy `eps`, for images in `unit_jy`.
 
         Its norm is measured unless given.
 
@@ -126,6 +138,8 @@ class Problem:
             ‖U^½Φ‖².
         support : bool (nx, ny), optional
             Pixels that may be non-zero; all by default.
+        finer : int (d,), optional
+            How many times the cells of each block's averages are halved.
         comm : casa_sara.parallel.serial.Serial or MPI
             Over whose ranks the samples are spread.
 
@@ -133,18 +147,45 @@ class Problem:
         -------
         Problem
         """
-        data = samples.data
-        sqrt_weight = np.sqrt(data.weight)
-        vis = data.vis * sqrt_weight
-        sqrt_weight *= np.float32(unit_jy)
-        measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=sqrt_weight, eps=eps,
-                                   nthreads=options.nthreads, comm=comm)
+        data, root_weight = samples.data, np.sqrt(samples.data.weight)
+        operator = partial(sky_operator, grid=grid, eps=eps, nthreads=options.nthreads, comm=comm)
+        vis, offsets = data.vis * root_weight, samples.offsets
+        measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy))
         precond = _preconditioner(samples, options.precondition, comm)
+        averaged = None
+        if options.averages:
+            with suppress(OverflowError):  # hardly two samples share one of so many cells
+                averaged, uvw, freq_hz = Averaged.of(data, offsets, averaging_cell(grid), finer, vis, measurement, comm)
+        if averaged is not None and comm.total(averaged.cells.size) > WORTHWHILE * comm.total(data.size):
+            averaged = None
+        if averaged is not None:
+            vis, offsets = averaged.whitened_mean(vis), averaged.cells.offsets
+            precond = averaged.weighted_mean(precond).astype(np.float32)
+            root_weight = np.sqrt(averaged.sum_of_weights, dtype=np.float32, casting="same_kind")
+            measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy))
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
-            data_norm_sq = comm.bcast(power_method(
-                lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32))
-        return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support)
+            data_norm_sq = float(comm.bcast(power_method(
+                lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32)))
+        return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged)
+
+
+def averaging_cell(grid: ImageGrid) -> np.ndarray:
+    """Return the sides of the cells within which samples are averaged: :func:`casa_sara.data.averaging.cell_sides`.
+
+    Parameters
+    ----------
+    grid : ImageGrid
+        Image for which they are averaged.
+
+    Returns
+    -------
+    float (4,)
+        Along v, u, w and ln ν.
+    """
+    index = 0.0 if grid.spectrum is None else float(np.abs(grid.spectrum.index).max())
+    depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
+    return cell_sides(grid.shape, grid.cell_rad, depth, index)
 
 
 def first_image(samples: Samples, problem_of: Callable[..., Problem], options: SolverOptions,
@@ -174,22 +215,49 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         In `problem.unit_jy`.
     """
     everything, wild, layout = samples.data.size, [], Layout(samples.offsets, comm)
-    problem = problem_of(samples)
+    finer = np.zeros(len(samples.offsets) - 1, int)
+    problem, error = problem_of(samples), np.zeros(1)
     for _ in range(ROUNDS):
-        first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
-                               NNLSFit(positivity=options.positivity), stopped, problem.support)
+        first, left = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
+                           NNLSFit(positivity=options.positivity), stopped, problem.support)
         samples = problem.samples
+        residual = left if problem.averaged is None else problem.averaged.residual(first)
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
-        if comm.total(found.index.size) == 0:
-            break
-        wild += _told_of_all(found, samples, layout, comm)
-        problem, residual = problem_of(samples.without(found.index)), np.delete(residual, found.index)
-    samples = problem.samples
+        if comm.total(found.index.size):
+            wild += _told_of_all(found, samples, layout, comm)
+            samples, residual = samples.without(found.index), np.delete(residual, found.index)
+        else:
+            error = _averaging_error(problem, residual, left, comm)
+            if error.max() <= LARGEST_ERROR:
+                break
+            # it goes with the square of the side
+            finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
+        problem = problem_of(samples, finer=finer)
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
-    nnls_norms = comm.norms(np.array([np.linalg.norm(residual[a:b])
-                                      for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]))
-    return problem, Findings(left_out, wild, nnls_norms, problem.data_norm_sq), first
+    norms = _norms(residual, samples.offsets, comm)
+    return problem, Findings(left_out, wild, norms, problem.data_norm_sq, finer, float(error.max())), first
+
+
+def _norms(vis, offsets, comm):
+    """Return the norm of each block, of all ranks."""
+    return comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in zip(offsets[:-1], offsets[1:])]))
+
+
+def _averaging_error(problem, residual, of_averages, comm):
+    """Return the error of the averages of an image in each block, float (d,), in units of their noise.
+
+    That is the noise measured in the data; where it is unknown, what the image leaves.  It is not taken for less than
+    the operator is accurate to, in single precision.
+    """
+    samples, averaged = problem.samples, problem.averaged
+    if averaged is None:
+        return np.zeros(len(samples.offsets) - 1)
+    noise = _norms(residual, samples.offsets, comm) / np.sqrt(2 * np.maximum(averaged.samples, 1))
+    if samples.noise is not None:
+        noise = np.where(np.isfinite(samples.noise), samples.noise, noise)
+    least = LEAST_NOISE * _norms(averaged.vis, samples.offsets, comm) / np.sqrt(np.maximum(averaged.samples, 1))
+    return averaged.error(residual, of_averages) / np.maximum(noise, np.maximum(least, np.finfo(float).tiny))
 
 
 def _told_of_all(found, samples, layout, comm):

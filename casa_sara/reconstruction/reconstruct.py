@@ -18,7 +18,7 @@ from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
-from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
+from casa_sara.reconstruction.problem import Findings, Problem, Samples, averaging_cell, first_image
 from casa_sara.reconstruction.state_file import digest
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, run_paper_algorithm_2
@@ -49,11 +49,14 @@ class Control:
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
         whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes
         it.
+    tell : callable
+        Takes a line for the log.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
     stopped: Callable[[], bool] = lambda: False
     checkpoint: Checkpoint | None = None
+    tell: Callable[[str], None] = lambda line: None
 
 
 @dataclass
@@ -79,6 +82,10 @@ class Reconstruction:
         Samples that were used, numbers into the data given.
     wild : list of dict
         The others, named: see :class:`casa_sara.data.outliers.WildSamples`.
+    averaging : dict
+        `averages` to which these samples were averaged, `cell_wavelengths` (u, v) of the largest uv cells, `halvings`
+        of each block's, and the `largest_error` of the averages of the first image in units of their noise; empty where
+        they were not.
     """
 
     model: np.ndarray
@@ -91,6 +98,7 @@ class Reconstruction:
     noise_jy_per_beam: float
     kept: np.ndarray
     wild: list[dict]
+    averaging: dict
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -141,8 +149,33 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         solution = _begin(samples, problem_of, options, startmodel, control.stopped, ranks)
         if control.stopped():
             control = replace(control, checkpoint=None)
+    averaging = _averaging(solution, averaging_cell(grid))
+    control.tell(_averaging_words(solution.ppd, averaging, options, averaging_cell(grid)))
     record = _iterate(solution, options, control, layout, ranks)
-    return _result(solution, record, samples, comm)
+    return _result(solution, record, samples, averaging, comm)
+
+
+def _averaging(solution, sides):
+    """Return what is kept of the averaging, as of `Reconstruction`."""
+    ppd, found = solution.ppd, solution.found
+    if ppd.averaged is None:
+        return {}
+    return dict(averages=int(ppd.block_sizes.sum()), cell_wavelengths=[float(sides[1]), float(sides[0])],
+                halvings=found.finer.tolist(), largest_error=found.averaging_error)
+
+
+def _averaging_words(ppd, averaging, options, sides):
+    """Return the line of the log on it."""
+    cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
+    if averaging:
+        smaller = 2 ** max(averaging["halvings"])
+        smallest = f", or up to {smaller} times smaller" if smaller > 1 else ""
+        return (f"{ppd.samples.sum()} visibilities are averaged to {averaging['averages']}, within each block and "
+                f"{cell}{smallest}: the averages of the first image are wrong by up to {averaging['largest_error']:.2g} of "
+                "their noise, which is put right at every re-weighting")
+    if options.averages:
+        return f"visibilities are not averaged: more than half of them would be left by {cell}"
+    return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"
 
 
 def _identify(checkpoint, samples, layout, grid, support, comm):
@@ -180,7 +213,7 @@ def _keep(solution, checkpoint, layout, ranks, stage, now):
         comm.once(checkpoint.keep, lambda: state, iteration, now=True)
 
 
-def _result(solution, record, samples, comm):
+def _result(solution, record, samples, averaging, comm):
     """Return what was found, in Jy."""
     found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
     model = comm.own(ppd.model)
@@ -191,7 +224,7 @@ def _result(solution, record, samples, comm):
         model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
-        wild=found.wild)
+        wild=found.wild, averaging=averaging)
 
 
 @dataclass
@@ -212,13 +245,15 @@ class _Solution:
         if options.method == PAPER:
             ppd = paper_iteration(problem, dictionary, found.data_norm_sq, options.positivity)
         else:
-            ppd = AdaptivePPD(measurement, dictionary, problem.vis, samples.offsets, problem.precond,
+            ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=ranks.comm)
-        ppd.unit_jy = problem.unit_jy
+        ppd.unit_jy, ppd.averaged = problem.unit_jy, problem.averaged
+        ppd.samples = ranks.comm.exscan(np.diff(samples.offsets))[1]
         if problem.support is not None:
             ppd.confine(problem.support)
         weights = samples.data.weight * np.float32(problem.unit_jy**2)
-        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weights, samples.noise, options))
+        weight_sums = ranks.comm.block_sums(weights, samples.offsets)
+        return cls(found, ppd, _bounds(ppd, found.nnls_norms, weight_sums, samples.noise, options))
 
     def state(self, stage, layout, ranks):
         """Return, on rank 0, all that :func:`_resume` needs beside data and parameters, as one rank alone has it."""
@@ -260,7 +295,7 @@ def _resume(samples, layout, problem_of, options, checkpoint, ranks):
                                   for name, value in state["found"].items()}
         found = Findings(**values)
         found.left_out = layout.here(found.left_out)
-        problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq)
+        problem = problem_of(samples.without(found.left_out), data_norm_sq=found.data_norm_sq, finer=found.finer)
         solution = _Solution.of(problem, found, options, ranks)
         ppd, kept = state["ppd"], Layout(solution.ppd.offsets, ranks.comm)
         ppd |= {name: kept.scatter(ppd[name]) for name in SAMPLE_ARRAYS}
@@ -268,6 +303,7 @@ def _resume(samples, layout, problem_of, options, checkpoint, ranks):
         solution.ppd.set_state(ppd)
         solution.bounds.set_state(state["bounds"])
         solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
+        solution.ppd.renew_averages(solution.stage.previous)
     return solution
 
 
@@ -338,11 +374,10 @@ def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
                     options.reltol, options.finalreltol, significance=options.significance)
 
 
-def _bounds(ppd, nnls_norms, weights, noise, options):
-    samples = ppd.block_sizes
+def _bounds(ppd, nnls_norms, weight_sums, noise, options):
+    samples = ppd.samples
     if options.method == PAPER:
-        return paper_bounds(ppd, nnls_norms, weights, options)
-    weight_sums = ppd.comm.block_sums(weights, ppd.offsets)
+        return paper_bounds(ppd, nnls_norms, weight_sums, options)
     common = dict(samples=samples, weight_sums=weight_sums, n_bases=ppd.dictionary.n_bases, regscale=options.regscale)
     if options.databound == "weights":
         return GivenBounds(chi_square_bounds(samples), **common)

@@ -87,6 +87,13 @@ class AdaptivePPD:
     ----------
     begins, block_sizes : int (d,)
         How many of a block's samples lie on ranks before this one, and on all.
+    averaged : object or None
+        What links averaged samples to those that they are averages of, by `renew(model, predicted)`: see
+        :meth:`renew_averages`.
+    samples : int (d,)
+        M_j, samples of each block, before they were averaged.
+    scatter : float (d,)
+        What the averages leave out of ‖y_j − Φ_j x‖², because it is the same for all x.
     model, model_bar : real (nx, ny)
         x and x̄.
     anchor : real (nx, ny)
@@ -145,6 +152,8 @@ class AdaptivePPD:
         self.threshold = 0.0
         self.multipliers, self.l2_bounds, self.constrained = np.zeros(self.n_blocks), np.zeros(self.n_blocks), False
         self.begins, self.block_sizes = comm.exscan(np.diff(self.offsets))
+        self.averaged: Any = None
+        self.samples, self.scatter = self.block_sizes, np.zeros(self.n_blocks)
         self.residual_norms = comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()]))
         self._pieces = np.array([(a, min(a + PIECE, stop), j) for j, (start, stop) in enumerate(self.blocks())
                                  for a in range(start, stop, PIECE)], dtype=int).reshape(-1, 3)
@@ -223,6 +232,18 @@ class AdaptivePPD:
         self.comm.barrier()
         self.measurement.forward(self.model, self._phi_anchor)
 
+    def renew_averages(self, model: np.ndarray) -> None:
+        """Where the samples are averages, make them anew: what they leave of this model, and their scatter, are exact.
+
+        Parameters
+        ----------
+        model : real (nx, ny)
+            In the unit of the iteration.
+        """
+        if self.averaged is not None:
+            self.measurement.forward(model, self.vis)
+            self.scatter = self.averaged.renew(model, self.vis)
+
     def constrain(self, l2_bounds: np.ndarray) -> None:
         """From now on, keep every block within its bound ε_j, float (d,): Step 5 finds the multipliers.
 
@@ -248,7 +269,7 @@ class AdaptivePPD:
         summed_norms_sq = self._update_data_dual()  # Steps 5–6
         self._update_prior_dual()  # Step 13
         self._update_image()  # Steps 17–19
-        np.sqrt(summed_norms_sq(), out=self.residual_norms)
+        np.sqrt(summed_norms_sq() + self.scatter, out=self.residual_norms)
         self.iteration += 1
 
     def _update_data_dual(self):

@@ -92,7 +92,7 @@ class Stage:
     Attributes
     ----------
     previous : real (nx, ny)
-        Model of the problem before.
+        Model of the problem before, for which averaged samples are exact.
     last : bool
         The weights will not change any more.
     start : int
@@ -196,6 +196,7 @@ def run_algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, sche
 
 def _begin(ppd, bounds, schedule):
     """The first problem."""
+    ppd.renew_averages(ppd.model)
     bounds.apply_to(ppd)
     first_weights(ppd, bounds, schedule.confined)
     stage = Stage(ppd.model.copy(), support=SignificantSupport(schedule.significance) if schedule.confined else None)
@@ -252,11 +253,12 @@ def _stop_code(ppd, bounds, schedule, stage):
 def _renew_weights(ppd, bounds, schedule, stage):
     """Re-weight by the present solution; return False, with nothing done, when one more would change nothing."""
     change = ppd.comm.bcast_numbers([_relative(ppd.model, stage.previous)])[0]
+    stage.previous[...] = ppd.model
+    ppd.renew_averages(stage.previous)
     scale = FIRST_SCALE * schedule.reweight_decay**stage.k
     released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
     if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, change):
         return False
-    stage.previous[...] = ppd.model
     support = stage.support
     pixels = support.update(ppd, bounds) if support else ppd.model.size
     reweight(ppd, bounds, max(scale, LAST_SCALE), support is not None)

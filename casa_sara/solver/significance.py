@@ -48,6 +48,9 @@ class SignificantSupport:
 
     def __init__(self, significance: float, begun: bool = False) -> None:
         self.significance, self.begun = float(significance), bool(begun)
+        self._noise_weights: np.ndarray | None = None  # for which there are a point response and a filter
+        self._psf: np.ndarray = np.zeros(0)
+        self._filter: MatchedFilter | None = None
 
     def update(self, ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> int:
         """Confine the model to what is significant now.
@@ -65,17 +68,18 @@ class SignificantSupport:
             Pixels of the support.
         """
         gradient = gradient_image(ppd, bounds, ppd.model)
-        psf = point_response(ppd, bounds)
+        if self._noise_weights is None or not np.array_equal(self._noise_weights, bounds.noise_weights):
+            self._psf, self._filter, self._noise_weights = point_response(ppd, bounds), None, bounds.noise_weights
         allowed = np.ones(ppd.model.shape, bool) if ppd.confined_to is None else ppd.confined_to
-        support, points = ppd.comm.once(self._found, gradient, psf, ppd.model, allowed, ppd.positivity,
+        support, points = ppd.comm.once(self._found, gradient, ppd.model, allowed, ppd.positivity,
                                         ppd.measurement.workers.count)
         self.begun = True
         ppd.support_only(support, points)
         return int(np.count_nonzero(support))
 
-    def _found(self, gradient, psf, model, allowed, positivity, workers):
+    def _found(self, gradient, model, allowed, positivity, workers):
         """Return the support and the point sources in it."""
-        filter_ = MatchedFilter(psf, workers)
+        self._filter = filter_ = self._filter or MatchedFilter(self._psf, workers)
         signed = (lambda snr: snr) if positivity else np.abs
         spectrum = filter_.spectrum(gradient)
         if not self.begun:
