@@ -13,7 +13,7 @@ from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.papermethod import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
 from casa_sara.parallel import SERIAL, Serial
-from casa_sara.problem import Findings, Problem, Samples, averaging_cell, first_image
+from casa_sara.problem import DYNAMIC_RANGE, Findings, Problem, Samples, averaging_cell, first_image
 from casa_sara.sharing import ALONE, Crew, Layout
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.checkpoint import Checkpoint
@@ -29,7 +29,6 @@ __all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "r
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
-DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
 
 @dataclass(frozen=True)

@@ -246,6 +246,15 @@ def test_cells_are_halved_where_the_first_image_is_too_bright_for_them():
     assert "2 times smaller" in told[0]
 
 
+def test_cells_are_not_halved_for_ever_nor_numbered_beyond_integers(monkeypatch):
+    """Noise that is far too low asks for cells so small that no two samples share one; smaller ones have no numbers."""
+    samples = replace(observed(40)[0], noise=np.full(2, 1e-9))
+    found = reconstruct(samples, GRID, replace(OPTIONS, niter=2))
+    assert found.averaging == {} and np.isfinite(found.model).all()
+    monkeypatch.setattr("casa_sara.averaging.PHASE", 1e-9)
+    assert reconstruct(samples, GRID, replace(OPTIONS, niter=2)).averaging == {}
+
+
 def test_nothing_is_averaged_where_it_is_not_worthwhile_or_not_possible():
     samples, _ = observed(40)
     told = []
