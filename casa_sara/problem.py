@@ -82,8 +82,8 @@ class Findings:
     """What is found before the first iteration.
 
     `left_out` (n,) are the numbers of the wild samples in the data given; `finer` (d,) is how often the cells are
-    halved within which each block is averaged, and `averaging_error` the largest error of the averages of the first image, in
-    units of their noise; the others are as in `Reconstruction`, in the units of the iteration.
+    halved within which each block is averaged, and `averaging_error` the largest error of the averages of the first
+    image, in units of their noise; the others are as in `Reconstruction`, in the units of the iteration.
     """
 
     left_out: np.ndarray

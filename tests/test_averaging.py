@@ -291,7 +291,7 @@ def test_averages_are_renewed_at_the_beginning_and_at_every_reweighting(monkeypa
 
 
 def test_a_solution_goes_on_with_its_averages(tmp_path):
-    """Stopped before and after a re-weighting, with cells that were halved, it ends at the same image to the last bit."""
+    """Stopped before and after a re-weighting, with cells that were halved, it ends at the same image, bit by bit."""
     samples = replace(observed(60)[0], noise=np.ones(2))
     options, path, reached = replace(OPTIONS, niter=150), str(tmp_path / "c"), [0]
 
