@@ -133,7 +133,7 @@ class SolverOptions:
 
     @property
     def averages(self) -> bool:
-        """Whether visibilities are averaged: not for the paper's method, nor for bounds as constraints."""
+        """Whether visibilities are averaged: not for the paper's method to the letter, nor where bounds constrain."""
         return self.averaging and self.method == "tsara" and self.databound == "adapt"
 
 

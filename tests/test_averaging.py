@@ -246,6 +246,15 @@ def test_cells_are_halved_where_the_first_image_is_too_bright_for_them():
     assert "2 times smaller" in told[0]
 
 
+def test_cells_are_not_halved_for_ever_nor_numbered_beyond_integers(monkeypatch):
+    """Noise that is far too low asks for cells so small that no two samples share one; smaller ones have no numbers."""
+    samples = replace(observed(40)[0], noise=np.full(2, 1e-9))
+    found = reconstruct(samples, GRID, replace(OPTIONS, niter=2))
+    assert found.averaging == {} and np.isfinite(found.model).all()
+    monkeypatch.setattr("casa_sara.averaging.PHASE", 1e-9)
+    assert reconstruct(samples, GRID, replace(OPTIONS, niter=2)).averaging == {}
+
+
 def test_nothing_is_averaged_where_it_is_not_worthwhile_or_not_possible():
     samples, _ = observed(40)
     told = []
@@ -282,7 +291,7 @@ def test_averages_are_renewed_at_the_beginning_and_at_every_reweighting(monkeypa
 
 
 def test_a_solution_goes_on_with_its_averages(tmp_path):
-    """Stopped before and after a re-weighting, with halved cells, it ends at the same image to the last bit."""
+    """Stopped before and after a re-weighting, with cells that were halved, it ends at the same image, bit by bit."""
     samples = replace(observed(60)[0], noise=np.ones(2))
     options, path, reached = replace(OPTIONS, niter=150), str(tmp_path / "c"), [0]
 

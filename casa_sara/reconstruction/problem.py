@@ -26,7 +26,7 @@ __all__ = ["Findings", "Problem", "Samples", "averaging_cell", "first_image"]
 
 ROUNDS = 6  # of leaving out wild samples
 LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
-LEAST_NOISE = 1e-6  # of the rms of the visibilities: what the operator is accurate to
+DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
@@ -229,10 +229,11 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
             samples, residual = samples.without(found.index), np.delete(residual, found.index)
         else:
             error = _averaging_error(problem, residual, left, comm)
-            if error.max() <= LARGEST_ERROR:
-                break
             # it goes with the square of the side
-            finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
+            more = np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
+            if not more.any():
+                break
+            finer = finer + more
         problem = problem_of(samples, finer=finer)
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
     norms = _norms(residual, samples.offsets, comm)
@@ -247,17 +248,15 @@ def _norms(vis, offsets, comm):
 def _averaging_error(problem, residual, of_averages, comm):
     """Return the error of the averages of an image in each block, float (d,), in units of their noise.
 
-    That is the noise measured in the data; where it is unknown, what the image leaves.  It is not taken for less than
-    the operator is accurate to, in single precision.
+    That is the noise measured in the data; where it is unknown, what the image leaves.
     """
     samples, averaged = problem.samples, problem.averaged
     if averaged is None:
         return np.zeros(len(samples.offsets) - 1)
-    noise = _norms(residual, samples.offsets, comm) / np.sqrt(2 * np.maximum(averaged.samples, 1))
-    if samples.noise is not None:
-        noise = np.where(np.isfinite(samples.noise), samples.noise, noise)
-    least = LEAST_NOISE * _norms(averaged.vis, samples.offsets, comm) / np.sqrt(np.maximum(averaged.samples, 1))
-    return averaged.error(residual, of_averages) / np.maximum(noise, np.maximum(least, np.finfo(float).tiny))
+    left, rms = (_norms(vis, samples.offsets, comm) / np.sqrt(2 * np.maximum(averaged.samples, 1))
+                 for vis in (residual, averaged.vis))
+    noise = left if samples.noise is None else np.where(np.isfinite(samples.noise), samples.noise, left)
+    return averaged.error(residual, of_averages) / np.maximum(noise, rms / DYNAMIC_RANGE + np.finfo(float).tiny)
 
 
 def _told_of_all(found, samples, layout, comm):

@@ -18,7 +18,7 @@ from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
-from casa_sara.reconstruction.problem import Findings, Problem, Samples, averaging_cell, first_image
+from casa_sara.reconstruction.problem import DYNAMIC_RANGE, Findings, Problem, Samples, averaging_cell, first_image
 from casa_sara.reconstruction.state_file import digest
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, run_paper_algorithm_2
@@ -31,7 +31,6 @@ __all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "r
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
-DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
 
 @dataclass(frozen=True)
@@ -169,9 +168,9 @@ def _averaging_words(ppd, averaging, options, sides):
     cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
     if averaging:
         smaller = 2 ** max(averaging["halvings"])
-        smallest = f", or up to {smaller} times smaller" if smaller > 1 else ""
+        finer = f", or up to {smaller} times smaller" if smaller > 1 else ""
         return (f"{ppd.samples.sum()} visibilities are averaged to {averaging['averages']}, within each block and "
-                f"{cell}{smallest}: the averages of the first image are wrong by up to {averaging['largest_error']:.2g} of "
+                f"{cell}{finer}: the averages of the first image are wrong by up to {averaging['largest_error']:.2g} of "
                 "their noise, which is put right at every re-weighting")
     if options.averages:
         return f"visibilities are not averaged: more than half of them would be left by {cell}"
