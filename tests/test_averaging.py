@@ -251,7 +251,7 @@ def test_cells_are_not_halved_for_ever_nor_numbered_beyond_integers(monkeypatch)
     samples = replace(observed(40)[0], noise=np.full(2, 1e-9))
     found = reconstruct(samples, GRID, replace(OPTIONS, niter=2))
     assert found.averaging == {} and np.isfinite(found.model).all()
-    monkeypatch.setattr("casa_sara.averaging.PHASE", 1e-9)
+    monkeypatch.setattr("casa_sara.data.averaging.PHASE", 1e-9)
     assert reconstruct(samples, GRID, replace(OPTIONS, niter=2)).averaging == {}
 
 

@@ -170,8 +170,8 @@ def _averaging_words(ppd, averaging, options, sides):
         smaller = 2 ** max(averaging["halvings"])
         finer = f", or up to {smaller} times smaller" if smaller > 1 else ""
         return (f"{ppd.samples.sum()} visibilities are averaged to {averaging['averages']}, within each block and "
-                f"{cell}{finer}: the averages of the first image are wrong by up to {averaging['largest_error']:.2g} of "
-                "their noise, which is put right at every re-weighting")
+                f"{cell}{finer}: the averages of the first image are wrong by up to "
+                f"{averaging['largest_error']:.2g} of their noise, which is put right at every re-weighting")
     if options.averages:
         return f"visibilities are not averaged: more than half of them would be left by {cell}"
     return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"
