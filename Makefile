@@ -8,12 +8,15 @@ python := $(abspath $(VENV))/bin/python
 
 .PHONY: test test-slow test-all lint coverage demo docs install tasks dist clean
 
+# make test COVERAGE=1, or make coverage, reports which lines the tests reach. Compiled kernels are not seen.
+cover = $(if $(COVERAGE),--cov=casa_sara --cov-append --cov-report=term:skip-covered)
+
 test: install
-	$(python) -m pytest -m "not slow"
+	$(python) -m pytest -m "not slow" $(cover) $(TESTS)
 
 # The tests that take longest; test-all runs both.
 test-slow: install
-	$(python) -m pytest -m slow
+	$(python) -m pytest -m slow $(cover) $(TESTS)
 
 test-all: test test-slow
 
@@ -28,10 +31,11 @@ build/lint/installed: Makefile
 	build/lint/bin/python -m pip install --quiet --disable-pip-version-check 'ruff ==0.17.*' 'mypy ==2.*' 'import-linter ==2.*'
 	touch $@
 
-# Which lines the tests reach: make coverage, or make coverage TESTS=tests/test_solver.py. Compiled kernels are not seen.
+# All tests, or make coverage TESTS=tests/test_solver.py.
+coverage: COVERAGE = 1
 coverage: install
-	$(python) -m pip install --quiet --disable-pip-version-check 'pytest-cov ==7.*'
-	$(python) -m pytest --cov=casa_sara --cov-report=term:skip-covered $(TESTS)
+	rm -f build/coverage
+	$(python) -m pytest $(cover) $(TESTS)
 
 demo: install
 	$(python) -m casa_sara.demo
