@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 
 import numpy as np
-from casa_sara.operators._simd import VECTOR_BYTES, load, splat, store
 from numba import njit
 
+from casa_sara.operators._vectors import VECTOR_BYTES, load, splat, store
 from casa_sara.operators._workers import Workers
 
 __all__ = ["bandwidth", "machine", "peak", "resident_mb", "seconds", "spread"]

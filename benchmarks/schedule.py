@@ -1,6 +1,6 @@
 """Iterations and quality of tsara alone on the cases of quality.py: in minutes, what a change of the schedule does.
 
-    python benchmarks/schedule.py FOLDER [--cases M31] [--against BEFORE.json]
+    python benchmarks/schedule.py FOLDER [--cases M31] [--against BEFORE.json] [--all-samples]
 
 Observations are those of quality.py; the solution is that of the task with defaults on one thread, two cases at a time.
 SNRs are those of the model, smoothed to half of and to the whole beam that the longest baseline and Briggs' weights
@@ -42,15 +42,16 @@ def observed(case: Case, base: Path):
     return sky, simulated, part, sampling_density(part.data, selection, grid), grid
 
 
-def solved(case: Case, base: Path) -> dict:
-    """Image a case, and say what became of it."""
+def solved(case: Case, base: Path, averaging: bool = True) -> dict:
+    """Image a case, with averages or with all samples, and say what became of it."""
     from casa_sara.analysis.metrics import smooth, snr
     from casa_sara.options import SolverOptions
     from casa_sara.reconstruction.problem import Samples
     from casa_sara.reconstruction.reconstruct import reconstruct
 
     sky, simulated, part, density, grid = observed(case, base)
-    found = reconstruct(Samples(part.data, part.offsets, density, part.noise), grid, SolverOptions(nthreads=1))
+    options = SolverOptions(nthreads=1, averaging=averaging)
+    found = reconstruct(Samples(part.data, part.offsets, density, part.noise), grid, options)
     ratio = found.l2_bounds / simulated["errors"]
     result = dict(iterations=found.record.iteration[-1], stop=found.record.stop_description,
                   raw=snr(sky.truth(), found.model),
@@ -77,6 +78,7 @@ def main():
     parser.add_argument("--cases", default="", help="only cases whose label holds this")
     parser.add_argument("--oversampling", type=int, default=3,
                         help="pixels of the sky in one of the image; 1: the image's own")
+    parser.add_argument("--all-samples", action="store_true", help="do not average the samples in uv cells")
     parser.add_argument("--against", type=Path, help="the results of an earlier run")
     options = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
@@ -86,7 +88,7 @@ def main():
           + "|---" * 7 + "|")
     results = {}
     with ProcessPoolExecutor(2, multiprocessing.get_context("spawn")) as pool:
-        for case, result in zip(grid, pool.map(partial(solved, base=base), grid)):
+        for case, result in zip(grid, pool.map(partial(solved, base=base, averaging=not options.all_samples), grid)):
             results[case.folder] = result
             print(row(case, result, earlier.get(case.folder)), flush=True)
     (base / "schedule.json").write_text(json.dumps(results))

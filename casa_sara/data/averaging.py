@@ -88,7 +88,7 @@ class Cells:
         # rows of the largest cells go to ranks, from the lowest v to the highest
         volume = int(np.prod(spans))
         row = keys % volume // (volume // spans[0]) >> finer[keys // volume]
-        owner = _owners(row, spans[0], key.size > 0, comm)
+        owner = _owners(row, key.size > 0, comm)
         self._sent = [np.flatnonzero(owner == rank) for rank in range(comm.size)]
         everything, self._place = np.unique(self._exchanged(keys), return_inverse=True)
         self.offsets = np.searchsorted(everything, np.arange(len(offsets)) * volume)
@@ -147,11 +147,12 @@ def _distinct(key, offsets):
     return np.concatenate(keys), cell
 
 
-def _owners(row, rows, holds, comm):
+def _owners(row, holds, comm):
     """Return the rank that each cell belongs to: those that hold samples share the rows of cells evenly."""
     holders = np.flatnonzero(comm.allgather(holds))
+    rows = comm.largest(int(row.max(initial=0))) + 1
     count = comm.allreduce(np.bincount(row, minlength=rows).astype(float))
-    before = np.minimum(np.cumsum(count) - count, count.sum() - 1)  # of rows above the last cell as well
+    before = np.cumsum(count) - count
     return holders[(before * (holders.size / count.sum())).astype(int)][row]
 
 

@@ -24,8 +24,9 @@ from casa_sara.solver.nnls import NNLSFit, nnls
 
 __all__ = ["Findings", "Problem", "Samples", "averaging_cell", "first_image"]
 
-ROUNDS = 6  # of leaving out wild samples
+ROUNDS = 6  # of leaving out wild samples, and of another first image
 LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
+MOST_HALVINGS = 8  # what is still wrong in cells 256 times smaller is not due to them
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
@@ -215,26 +216,22 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         In `problem.unit_jy`.
     """
     everything, wild, layout = samples.data.size, [], Layout(samples.offsets, comm)
-    finer = np.zeros(len(samples.offsets) - 1, int)
-    problem, error = problem_of(samples), np.zeros(1)
-    for _ in range(ROUNDS):
+    finer, rounds = np.zeros(len(samples.offsets) - 1, int), 0
+    while True:
+        problem = problem_of(samples, finer=finer)
         first, left = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                            NNLSFit(positivity=options.positivity), stopped, problem.support)
-        samples = problem.samples
         residual = left if problem.averaged is None else problem.averaged.residual(first)
+        error = _averaging_error(problem, residual, left, comm)
+        if error.max() > LARGEST_ERROR and finer.max() < MOST_HALVINGS:  # it goes with the square of the side
+            finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
+            continue
         found = find_wild(samples.data, samples.offsets, residual,
                           problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
-        if comm.total(found.index.size):
-            wild += _told_of_all(found, samples, layout, comm)
-            samples, residual = samples.without(found.index), np.delete(residual, found.index)
-        else:
-            error = _averaging_error(problem, residual, left, comm)
-            # it goes with the square of the side
-            more = np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
-            if not more.any():
-                break
-            finer = finer + more
-        problem = problem_of(samples, finer=finer)
+        if comm.total(found.index.size) == 0 or rounds == ROUNDS:
+            break
+        wild += _told_of_all(found, samples, layout, comm)
+        samples, finer, rounds = samples.without(found.index), np.zeros_like(finer), rounds + 1
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
     norms = _norms(residual, samples.offsets, comm)
     return problem, Findings(left_out, wild, norms, problem.data_norm_sq, finer, float(error.max())), first
