@@ -128,6 +128,7 @@ class SolverOptions:
     finalreltol: float = 3e-4
     regscale: float = 1.0
     significance: float = 5.0
+    ndraws: int = 0
     nthreads: int = 1
 
 

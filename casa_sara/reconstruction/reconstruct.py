@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +16,19 @@ from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.bootstrap import Bootstrap
 from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.draws import FEWEST, Draws
 from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
 from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
 from casa_sara.reconstruction.state_file import digest
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, run_paper_algorithm_2
+from casa_sara.solver.islands import add_flux_errors
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
-from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
+from casa_sara.solver.record import CONVERGED, DIVERGED, NOISE_ONLY, UNFINISHED, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, run_algorithm_2
+from casa_sara.solver.significance import SignificantSupport
 
 __all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
 
@@ -47,11 +52,14 @@ class Control:
     checkpoint : Checkpoint, optional
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
         whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
+    drawn : callable
+        Called with the `Draws` before the first draw of the bootstrap, and after each.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
     stopped: Callable[[], bool] = lambda: False
     checkpoint: Checkpoint | None = None
+    drawn: Callable[[Draws], None] = lambda draws: None
 
 
 @dataclass
@@ -77,6 +85,8 @@ class Reconstruction:
         Samples that were used, numbers into the data given.
     wild : list of dict
         The others, named: see :class:`casa_sara.data.outliers.WildSamples`.
+    draws : Draws or None
+        Of the bootstrap, where it was asked for and the solution has come to an end.
     """
 
     model: np.ndarray
@@ -89,6 +99,20 @@ class Reconstruction:
     noise_jy_per_beam: float
     kept: np.ndarray
     wild: list[dict]
+    draws: Draws | None = None
+
+    @classmethod
+    def of(cls, state: dict[str, Any]) -> Reconstruction:
+        """Make it of its attributes as a checkpoint has them, the record as of :meth:`SolverRecord.state`."""
+        record = SolverRecord()
+        record.set_state(state["record"])
+        values = {name: np.array(value) if isinstance(value, np.ndarray) else value for name, value in state.items()}
+        return cls(**values | dict(record=record))
+
+    @property
+    def finished(self) -> bool:
+        """Whether a restart would have nothing to continue."""
+        return self.record.stop_code not in UNFINISHED and (self.draws is None or self.draws.complete)
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -136,8 +160,13 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         solution = _begin(samples, problem_of, options, startmodel, control.stopped, ranks)
         if control.stopped():
             control = replace(control, checkpoint=None)
-    record = _iterate(solution, options, control, layout, ranks)
-    return _result(solution, record, samples, comm)
+    if solution.result is None:
+        record = _iterate(solution, options, control, layout, ranks)
+        _begin_draws(solution, record, options)
+        solution.result = _result(solution, record, samples, comm)
+    if solution.bootstrap is not None:
+        _draw(solution, control, layout, ranks)
+    return solution.result
 
 
 def _identify(checkpoint, samples, layout, grid, support, comm):
@@ -162,6 +191,30 @@ def _iterate(solution, options, control, layout, ranks):
     return run(solution.ppd, solution.bounds, schedule, control.progress, control.stopped, keep, solution.stage)
 
 
+def _begin_draws(solution, record, options):
+    """Make ready for the draws, once the solution has come to an end; an empty model has no errors to draw."""
+    ppd = solution.ppd
+    if options.ndraws and record.stop_code not in (*UNFINISHED, DIVERGED):
+        draws = Draws(ppd.model.shape, options.ndraws if ppd.model.any() else 0)
+        scale = record.reweightings[-1]["scale"] if record.reweightings else 0.0
+        solution.bootstrap = Bootstrap(ppd, solution.bounds, _support(options), scale, ppd.model.copy(), ppd.threshold, draws)
+
+
+def _support(options):
+    """Return the support of a solution that has found one, None where nothing confines the model."""
+    return SignificantSupport(options.significance, begun=True) if schedule_of(options).confined else None
+
+
+def _draw(solution, control, layout, ranks):
+    """Make the draws of the bootstrap, keeping the state now and then; add the errors of the islands to the record."""
+    keep = partial(_keep, solution, control.checkpoint, layout, ranks, None)
+    draws = solution.bootstrap.draws
+    control.drawn(draws)
+    solution.bootstrap.run(control.stopped, control.drawn, keep)
+    if len(draws) >= FEWEST:
+        add_flux_errors(solution.result.record.islands, solution.bootstrap.model, draws.flux_errors)
+
+
 def _keep(solution, checkpoint, layout, ranks, stage, now):
     """Write the checkpoint if there is one and its time has come, or `now`."""
     if checkpoint is None:
@@ -177,15 +230,16 @@ def _keep(solution, checkpoint, layout, ranks, stage, now):
 def _result(solution, record, samples, comm):
     """Return what was found, in Jy."""
     found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
-    model = comm.own(ppd.model)
+    bootstrap = solution.bootstrap
+    model = bootstrap.model.copy() if bootstrap else comm.own(ppd.model)
     if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
     return Reconstruction(
-        model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
+        model, bounds.l2_bounds, ppd.residual_norms.copy(), found.nnls_norms, record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
-        wild=found.wild)
+        wild=found.wild, draws=bootstrap and bootstrap.draws)
 
 
 @dataclass
@@ -196,6 +250,8 @@ class _Solution:
     ppd: AdaptivePPD
     bounds: AdaptiveBounds | GivenBounds | PaperBounds
     stage: Stage | PaperStage | None = None
+    result: Reconstruction | None = None
+    bootstrap: Bootstrap | None = None
 
     @classmethod
     def of(cls, problem, found, options, ranks):
@@ -221,7 +277,11 @@ class _Solution:
         ppd, kept = self.ppd.state(), Layout(self.ppd.offsets, ranks.comm)
         ppd |= {name: kept.gather(ppd[name]) for name in SAMPLE_ARRAYS}
         ppd |= {name: ranks.gather_bases(ppd[name]) for name in BASIS_ARRAYS}
-        return dict(found=found, ppd=ppd, bounds=self.bounds.state(), stage=stage.state())
+        state = dict(found=found, ppd=ppd, bounds=self.bounds.state())
+        if self.bootstrap is None:
+            return state | dict(stage=stage.state())
+        result = vars(self.result) | dict(record=self.result.record.state(), kept=None, draws=None)
+        return state | dict(result=result, bootstrap=self.bootstrap.state())
 
 
 def _begin(samples, problem_of, options, startmodel, stopped, ranks):
@@ -260,8 +320,20 @@ def _resume(samples, layout, problem_of, options, checkpoint, ranks):
         ppd |= {name: ranks.scatter_bases(ppd[name]) for name in BASIS_ARRAYS}
         solution.ppd.set_state(ppd)
         solution.bounds.set_state(state["bounds"])
-        solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
+        if "bootstrap" in state:
+            kept = np.delete(samples.kept, found.left_out)
+            _resume_draws(solution, options, state["result"] | dict(kept=kept), state["bootstrap"])
+        else:
+            solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
     return solution
+
+
+def _resume_draws(solution, options, result, state):
+    """Take over the result, and the draws so far."""
+    solution.result = Reconstruction.of(result)
+    solution.result.draws = draws = Draws.of(state["draws"])
+    solution.bootstrap = Bootstrap(solution.ppd, solution.bounds, _support(options), state["scale"], np.array(state["model"]),
+                                   state["threshold"], draws, state["done"])
 
 
 def check_l2bound(options: SolverOptions, blocks: int) -> None:

@@ -1,0 +1,109 @@
+"""The parametric bootstrap: the same sky observed again with other noise, and solved again, tells the error of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from casa_sara.reconstruction.draws import Draws
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.l1_weights import reweight
+from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
+from casa_sara.solver.noise_draws import draw_noise
+from casa_sara.solver.significance import SignificantSupport
+
+__all__ = ["DRAW_ITERATIONS", "DRAW_REWEIGHTINGS", "Bootstrap"]
+
+STAGES, INTERVAL = 3, 30  # problems of a draw, and iterations of each
+DRAW_ITERATIONS, DRAW_REWEIGHTINGS = STAGES * INTERVAL, STAGES - 1
+SEED = 20181
+
+
+@dataclass
+class Bootstrap:
+    """Draws of the model x̂ of a solution: y* = Φx̂ + σ_j n with new noise n at the levels σ_j found, solved as y was.
+
+    A draw begins where the draw before has ended, the first one with the solution, and goes through the last steps of
+    Algorithm 2: three problems of 30 iterations, with support and weights found anew between them.  The noise levels stay.
+
+    Parameters
+    ----------
+    ppd : AdaptivePPD
+        After its solution, of which it keeps the dual variables; its data are replaced.
+    bounds : GivenBounds or AdaptiveBounds
+        Whose levels are those of the noise.
+    support : SignificantSupport or None
+    scale : float
+        α of the last weights; 0 where there was no re-weighting.
+    model : real (nx, ny)
+        x̂, in the unit of the iteration.
+    threshold : float
+        κ of the solution.
+    draws : Draws
+    done : int
+        Iterations of the present draw that are done.
+    """
+
+    ppd: AdaptivePPD
+    bounds: GivenBounds | AdaptiveBounds
+    support: SignificantSupport | None
+    scale: float
+    model: np.ndarray
+    threshold: float
+    draws: Draws
+    done: int = 0
+
+    def run(self, stopped: Callable[[], bool], progress: Callable[[Draws], None], keep: Callable[[bool], None]) -> None:
+        """Make the draws that are missing.
+
+        Parameters
+        ----------
+        stopped : callable
+            Asked after every iteration; True ends it with the draws that are complete.
+        progress : callable
+            Called after every draw.
+        keep : callable
+            Called between iterations, with whether it was stopped: from the states of the iteration and of this
+            (:meth:`state`) another one goes on as this one would have.
+        """
+        while not self.draws.complete:
+            self._observe()
+            while self.done < DRAW_ITERATIONS:
+                if self.done and self.done % INTERVAL == 0:
+                    self._renew_weights()
+                self.ppd.step()
+                self.done += 1
+                ending = stopped()
+                keep(ending)
+                if ending:
+                    return
+            difference = self.ppd.scratch_image
+            np.subtract(self.ppd.model, self.model, out=difference)
+            difference *= difference.dtype.type(self.ppd.unit_jy)
+            self.draws.add(difference)
+            self.done = 0
+            progress(self.draws)
+
+    def _observe(self):
+        """Replace the data by those of the present draw, which depend on its number alone."""
+        ppd, noise = self.ppd, self.ppd.scratch_vis
+        ppd.measurement.forward(self.model, ppd.vis)
+        draw_noise(ppd, np.random.default_rng([SEED, len(self.draws)]), self.bounds.noise, noise)
+        ppd.vis += noise
+        if not self.done:
+            ppd.rescale(self.threshold)
+
+    def _renew_weights(self):
+        """Find support and weights anew; the bounds then are what they were in the last problem of the solution."""
+        if self.support:
+            self.support.update(self.ppd, self.bounds)
+        if self.scale:
+            reweight(self.ppd, self.bounds, self.scale, self.support is not None)
+            self.bounds.finish(self.ppd)
+
+    def state(self) -> dict[str, Any]:
+        """Return what :meth:`run` goes on from, beside the states of the iteration and of the bounds."""
+        return dict(scale=self.scale, model=self.model, threshold=self.threshold, draws=self.draws.arrays(), done=self.done)
