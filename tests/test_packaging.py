@@ -39,7 +39,7 @@ PACKAGES = {
     },
     "demo": {"__init__", "analysis", "comparison", "options", "runtime", "numpy", "finufft", "matplotlib", *CASA},
     "comparison": {"analysis", "imaging", "version", "numpy", *OF_CASA, *LIBRARY},
-    "imaging": {"version", "numpy", "scipy", *OF_CASA, *LIBRARY},
+    "imaging": {"analysis", "version", "numpy", "scipy", *OF_CASA, *LIBRARY},
     "casa": set(),
     "casa.images": {"casa.ms", "casa.runtime", "options", "runtime", "version", "numpy", "scipy", "astropy", *CASA},
     "casa.ms": {"casa.runtime", "data", "parallel", "runtime", "numpy", "scipy", "astropy", *CASA},

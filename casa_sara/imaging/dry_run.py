@@ -121,7 +121,7 @@ def dry_run(selection, grid, options, blocks, limits):
     for line in _time_lines(timing):
         log.info(line)
     seconds = {name: getattr(timing, name) for name in ("reading", "building", "pair", "nnls_iteration", "iteration",
-                                                        "writing", "total")}
+                                                        "drawing", "writing", "total")}
     return found.summary() | {"visibilities": everything, "iterations": timing.iterations, "seconds": seconds,
                               "iteration_s": timing.iteration}
 
@@ -133,6 +133,7 @@ def _time_lines(timing):
            "the data)")
     rows = {"reading": timing.reading, "building the operator": timing.building,
             "one NNLS iteration": timing.nnls_iteration, "one solver iteration": timing.iteration,
+            **({f"{timing.draws} draws of the bootstrap": timing.drawing} if timing.draws else {}),
             "writing the images": timing.writing}
     for name, seconds in rows.items():
         yield f"  {name:<26}{seconds:10.3f} s"

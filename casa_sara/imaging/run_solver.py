@@ -20,7 +20,9 @@ from casa_sara.imaging.time_forecast import Pace
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS
 from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.draws import FEWEST
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.reconstruct import Control, Reconstruction, reconstruct, schedule_of
 from casa_sara.runtime.deadline import Deadline
@@ -30,7 +32,7 @@ from casa_sara.solver.nnls import NNLS_ITERATIONS
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED, SolverRecord
 from casa_sara.version import __version__
 
-__all__ = ["Watch", "checkpoint_of", "density_of", "list_islands", "solve_image", "without_wild"]
+__all__ = ["Watch", "checkpoint_of", "density_of", "expected_iterations", "list_islands", "solve_image", "without_wild"]
 
 MOST_NAMED = 20  # wild samples that the log names one by one
 MOST_TOLD = 20  # islands of emission that the log lists
@@ -109,7 +111,7 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
             preparing()
             return bool(ranks.comm.bcast_numbers([pressed() or bool(watch and watch.deadline.near())])[0])
 
-        control = Control(report, stopped, watch.checkpoint if watch else None)
+        control = Control(report, stopped, watch.checkpoint if watch else None, _Drawing(progress, preparing))
         if not (control.checkpoint and control.checkpoint.state is not None):
             progress.prepare("computing the norm of the measurement operator, and the first image by non-negative least squares "
                              f"(NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
@@ -119,7 +121,13 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     if record.stop_code == STOPPED_BY_USER and not ranks.comm.bcast(pressed()):
         record.stop_code = TIME_LIMIT
     _log_end(reconstruction, samples.offsets, control.checkpoint, ranks.comm)
+    _log_draws(reconstruction, control.checkpoint)
     return reconstruction
+
+
+def expected_iterations(options: SolverOptions) -> int:
+    """A guess of the iterations of a run: those of the solution and those of the draws."""
+    return schedule_of(options).expected_iterations + options.ndraws * DRAW_ITERATIONS
 
 
 def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd, record):
@@ -151,6 +159,33 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")
+
+
+class _Drawing:
+    """The progress of the bootstrap, after every draw."""
+
+    def __init__(self, progress, preparing):
+        self._progress, self._preparing = progress, preparing
+
+    def __call__(self, draws):
+        """Say how many draws are made; before the first one, too."""
+        self._preparing.over = True
+        self._progress.draw(len(draws), draws.asked)
+
+
+def _log_draws(reconstruction, checkpoint):
+    """Write to the log what became of the bootstrap."""
+    draws = reconstruction.draws
+    if draws is None:
+        return
+    if not draws.asked:
+        log.info("no draws: the model is empty")
+    elif draws.complete:
+        log.info(f"errors of the model follow from {len(draws)} draws")
+    else:
+        what = "errors follow from these" if len(draws) >= FEWEST else "no errors follow from so few"
+        go_on = f"; restart = True makes the others, from '{checkpoint.path}'" if checkpoint and checkpoint.stands else ""
+        log.warn(f"{len(draws)} draws of {draws.asked} were made before the run was stopped: {what}{go_on}")
 
 
 class _Preparing:
@@ -257,7 +292,8 @@ def _log_islands(record, significance, cell_rad):
                  + (f", the {MOST_TOLD} most significant:" if len(islands) > MOST_TOLD else ":" if islands else ""))
     for island in islands[:MOST_TOLD]:
         place = " ".join(_shortened(island[name], digits) for name in ("right_ascension", "declination"))
-        log.info(f"  {place}: {island['flux_jy']:.4g} +- {island['flux_error_jy']:.2g} Jy, S/N {island['snr']:.3g}, "
+        error = island.get("bootstrap_error_jy", island["flux_error_jy"])
+        log.info(f"  {place}: {island['flux_jy']:.4g} +- {error:.2g} Jy, S/N {island['snr']:.3g}, "
                  f"FWHM {island['fwhm_arcsec']:.3g} arcsec")
     if faint:
         log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")

@@ -11,15 +11,17 @@ import numpy as np
 from casa_sara.data.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.sky import sky_operator
+from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, DRAW_REWEIGHTINGS
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
 from casa_sara.reconstruction.reconstruct import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.nnls import NNLS_ITERATIONS, nnls
 
-__all__ = ["Pace", "Timing", "measure", "writing_seconds"]
+__all__ = ["Pace", "Timing", "error_seconds", "measure", "writing_seconds"]
 
 STARTING = 5.0  # libraries, compiled code, image plane
 WRITE_BASE, WRITE_SAMPLE, WRITE_PIXEL = 1.0, 6e-7, 2.5e-7
+SMOOTH_PIXEL = 3e-7
 MARGIN = 2.0  # on these: disks differ
 NORM_PAIRS = 60  # Φ and Φ† for ‖Φ‖, in all
 REWEIGHTING = 4  # iterations' time of one re-weighting
@@ -39,6 +41,8 @@ class Timing:
         Expected; the data decide.
     channels : int
         Of the image, each of which takes as much.
+    draws : int
+        Of the bootstrap.
     """
 
     reading: float
@@ -51,6 +55,12 @@ class Timing:
     reweightings: int
     channels: int = 1
     nnls_iterations: int = NNLS_ITERATIONS
+    draws: int = 0
+
+    @property
+    def drawing(self) -> float:
+        """Seconds of the bootstrap."""
+        return self.draws * (DRAW_ITERATIONS + REWEIGHTING * DRAW_REWEIGHTINGS) * self.iteration
 
     @property
     def total(self) -> float:
@@ -59,7 +69,7 @@ class Timing:
             return STARTING + self.reading + self.channels * (self.building + self.writing)
         solving = (self.iterations + REWEIGHTING * self.reweightings) * self.iteration
         first = NORM_PAIRS * self.pair + self.nnls_iterations * self.nnls_iteration
-        return STARTING + self.reading + self.channels * (self.building + first + solving + self.writing)
+        return STARTING + self.reading + self.channels * (self.building + first + solving + self.drawing + self.writing)
 
 
 def measure(data, offsets, grid, options, reading):
@@ -79,7 +89,7 @@ def measure(data, offsets, grid, options, reading):
     -------
     Timing
     """
-    writing = writing_seconds(data.size, grid.shape)
+    writing = writing_seconds(data.size, grid.shape) + error_seconds(options.ndraws, grid.shape)
     if not options.niter:
         return Timing(reading, 0.0, 0.0, 0.0, 0.0, writing, 0, 0)
     start = time.perf_counter()
@@ -100,7 +110,7 @@ def measure(data, offsets, grid, options, reading):
     schedule = schedule_of(options)
     of_blocks = schedule.nnls_iterations if options.method == PAPER else 0
     return Timing(reading, building, pair, first, _seconds(ppd.step), writing, schedule.expected_iterations,
-                  schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks)
+                  schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks, draws=options.ndraws)
 
 
 def _seconds(call, repeats=3):
@@ -117,6 +127,11 @@ def _seconds(call, repeats=3):
 def writing_seconds(samples, shape):
     """Seconds that making and writing the images takes, with a margin."""
     return MARGIN * (WRITE_BASE + WRITE_SAMPLE * samples + WRITE_PIXEL * math.prod(shape))
+
+
+def error_seconds(draws, shape):
+    """Seconds that making and writing the images of errors from so many draws takes, with a margin."""
+    return MARGIN * (draws * SMOOTH_PIXEL + 2 * bool(draws) * WRITE_PIXEL) * math.prod(shape)
 
 
 class Pace:

@@ -90,6 +90,7 @@ TSARA = (
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
     Parameter('significance', ('double',), 5.0, 'Signal-to-noise ratio above which emission enters the model; 0 for no limit', minimum=0.0),
+    Parameter('ndraws', ('int',), 0, 'Draws of the bootstrap that gives the errors of the model; 0: none, 20 are usual', minimum=0.0),
     Parameter('blocks', ('int', 'string', 'stringVec'), 0, 'Data blocks, each with its own noise level: 0 for one per snapshot, a number, or selections of data'),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0, maximum=1024.0),
     Parameter('dryrun', ('bool',), False, 'Only predict the memory and time of the run'),

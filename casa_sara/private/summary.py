@@ -166,6 +166,8 @@ def _solution(result, options, full):
         sara["wild"] = [dict(sample) for sample in solved.wild]
         sara["islands"] = [dict(island) for island in record.islands]
         sara["residual_snr"] = [dict(peak) for peak in record.residual_snr]
+        if solved.draws is not None:
+            sara["draws"] = {"asked": options.ndraws, "made": len(solved.draws)}
         sara["reweightings"] = [dict(update) for update in record.reweightings]
         sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds} for iteration, bounds in record.bounds]
         if full:

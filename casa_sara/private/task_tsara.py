@@ -79,7 +79,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
 
 def _prepare(parameters, selection, grid, stack):
     """Take the imagename for as long as the stack lasts, and return the options of the output."""
-    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked)
+    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"]))
     stack.enter_context(one_run_of(parameters["imagename"]))
     recover_products(parameters["imagename"])
     output = _output(parameters)
@@ -171,6 +171,9 @@ def _refuse_for_cubes(parameters):
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
+    if parameters["ndraws"]:
+        raise ValueError(f"ndraws = {parameters['ndraws']} with specmode = 'cube': errors are drawn for continuum images only; "
+                         "should be 0")
     if parameters["report"]:
         raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be False")
 
@@ -195,6 +198,7 @@ def _check_method(parameters):
         return
     for name, right, reason in (("regscale", 1.0, "its prior has no weight that depends on the noise"),
                                 ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
+                                ("ndraws", 0, "its errors are not known from draws"),
                                 ("parallel", False, "it runs in one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, "
@@ -258,6 +262,9 @@ def _solver_options(parameters, comm):
     if parameters["databound"] == "fixed" and not parameters["l2bound"]:
         raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
                          "blocks or one for each, relative to the MS weights")
+    if parameters["ndraws"] == 1 or parameters["ndraws"] and parameters["niter"] == 0:
+        raise ValueError(f"ndraws = {parameters['ndraws']} with niter = {parameters['niter']}: an error takes two draws or more "
+                         "of a model that was solved; should be 0, or at least 2 (20 are usual)")
     if not parameters["regscale"] > 0:
         raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the automatic weight of the prior")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}

@@ -1,0 +1,45 @@
+"""The images of the errors that the draws of a bootstrap give."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from casa_sara.analysis.metrics import beam_pixels, smooth
+from casa_sara.casa.images.restore import restored_beam
+from casa_sara.casa.images.sky_image import beam_numbers
+from casa_sara.reconstruction.draws import FEWEST, Draws
+
+__all__ = ["error_images"]
+
+ARCSEC = np.radians(1 / 3600)
+
+
+def error_images(draws: Draws | None, fitted: dict, restoringbeam: tuple[str, ...] | None,
+                 cell_rad: tuple[float, float]) -> dict[str, np.ndarray]:
+    """Return the error of the model, and that of the model smoothed to the restoring beam.
+
+    Parameters
+    ----------
+    draws : Draws or None
+    fitted : dict
+        Beam of the PSF, of :func:`casa_sara.casa.images.restore.fit_beam`.
+    restoringbeam : tuple of str or None
+        As of :class:`casa_sara.options.Output`.
+    cell_rad : (float, float)
+        Pixel size.
+
+    Returns
+    -------
+    dict
+        'model.error' in Jy/pixel and, where there is a restored image, 'image.error' in Jy/beam, float32 (nx, ny); empty with
+        fewer than two draws.
+    """
+    if draws is None or len(draws) < FEWEST:
+        return {}
+    errors = {"model.error": draws.error()}
+    if restoringbeam is not None:
+        *axes, angle = beam_numbers(restored_beam(list(restoringbeam), fitted))
+        cell = tuple(size / ARCSEC for size in cell_rad)
+        per_beam = beam_pixels(axes, cell)
+        errors["image.error"] = draws.error(lambda difference: per_beam * smooth(difference, axes, angle, cell))
+    return errors
