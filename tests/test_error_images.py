@@ -3,6 +3,7 @@
 import contextlib
 import os
 import re
+import shutil
 from unittest import mock
 
 import numpy as np
@@ -11,7 +12,7 @@ from simulated_ms import pixels, simulate
 
 pytest.importorskip("casatools")
 
-from casa_sara import tsara
+from casa_sara import saracompare, tsara
 from casa_sara.casa.runtime import log
 from casa_sara.imaging import run_solver
 from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS
@@ -205,3 +206,54 @@ def test_a_dry_run_tells_what_the_draws_take(vis, folder):
     memory = [one["forecast"]["memory_bytes"] for one in (found, without)]
     assert "draws" in memory[0]["bootstrap"] and "bootstrap" not in memory[1]
     assert memory[0]["bootstrap"]["draws"] == int(4 * (1.5 * 4 * 0.3) * 72**2) + 4 * 2 * 72**2
+
+
+# regions of saracompare
+
+REGION = "19h59m27.44s +40d44m09s 6arcsec"
+
+
+def region_of(vis, *names):
+    measures = saracompare(models=[str(name) for name in names], vis=vis, datacolumn="data", regions=[f"east = {REGION}"])
+    return measures["products"]
+
+
+def flux_errors_by_hand(name, inside):
+    return np.sqrt(np.mean([difference[inside].sum() ** 2 for difference in kept_draws(name).differences()]))
+
+
+def test_a_region_has_the_error_of_the_sum_of_its_pixels(whole, vis, folder):
+    image(vis, folder / "coarse", ndraws=0, cell="1.1arcsec")
+    found = region_of(vis, folder / "whole", folder / "coarse")
+    nx = np.indices((72, 72))
+    inside = np.hypot(nx[0] - (36 + 12.04 / 0.9), nx[1] - (36 + 7 / 0.9)) <= 6 / 0.9  # the region's centre in pixels
+    east = found["whole"]["regions"]["east"]
+    assert east["model_flux_jy"] == pytest.approx(pixels(folder / "whole.model")[inside].sum(), rel=1e-3)
+    assert east["model_error_jy"] == pytest.approx(flux_errors_by_hand(folder / "whole", inside), rel=0.05)
+    assert "model_error_jy" not in found["coarse"]["regions"]["east"]
+
+
+def test_on_other_pixels_the_error_is_nearly_the_same(whole, vis, folder):
+    image(vis, folder / "coarse", ndraws=0, cell="1.1arcsec", overwrite=True)
+    errors = [region_of(vis, *order)["whole"]["regions"]["east"]["model_error_jy"]
+              for order in ((folder / "whole", folder / "coarse"), (folder / "coarse", folder / "whole"))]
+    assert errors[1] == pytest.approx(errors[0], rel=0.1)
+
+
+def test_draws_of_another_image_and_damaged_ones_are_refused(vis, folder):
+    for name in ("one", "other"):
+        image(vis, folder / name, ndraws=2, **dict(imsize=80) if name == "other" else {})
+    shutil.copy(f"{folder / 'other'}.draws.npz", f"{folder / 'one'}.draws.npz")
+    with pytest.raises(ValueError, match=r"one.draws.npz' is of an image of 80 x 80 pixels, .*72 x 72"):
+        region_of(vis, folder / "one", folder / "other")
+    os.unlink(f"{folder / 'one'}.draws.npz")
+    arrays = kept_draws(folder / "other").arrays()
+    for change in (dict(pixels=arrays["pixels"] + 6400), dict(values=arrays["values"][1:]), dict(counts=arrays["counts"] * 3)):
+        np.savez(f"{folder / 'other'}.draws.npz", **arrays | change)
+        with pytest.raises(ValueError, match="models: '.*other.draws.npz' cannot be read as the draws of a model"):
+            region_of(vis, folder / "other", folder / "one")
+    for content in (b"", b"PK nothing"):
+        with open(f"{folder / 'other'}.draws.npz", "wb") as file:
+            file.write(content)
+        with pytest.raises(ValueError, match="models: '.*other.draws.npz' cannot be read"):
+            region_of(vis, folder / "other", folder / "one")

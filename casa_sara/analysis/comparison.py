@@ -30,6 +30,8 @@ class Product:
     record : dict
         What tsara recorded of the run ('history', 'bounds', 'blocks', 'reweightings' as in its return dictionary);
         empty for other imagers.
+    region_errors : dict
+        Region → error of the model's flux in it, Jy, from the draws of a bootstrap; empty where there are none.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Product:
     restored: dict[str, np.ndarray] = field(default_factory=dict)
     parameters: dict[str, str] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
+    region_errors: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,7 @@ class Comparison:
         Plain numbers, strings, lists and dicts only:
         `products` → name → {flux_jy, peak_jy_per_pixel, negative_jy, mdr, fwhm_recovered_arcsec, injected → {source →
         {injected_jy, flux_jy, offset_arcsec, fwhm_arcsec, fwhm_in_beams → {weighting → ratio}}}, regions → {name →
-        {flux_jy, error_jy}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness, chi_square →
+        {flux_jy, error_jy, model_flux_jy, model_error_jy}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness, chi_square →
         [of each block]}, truth → {snr, log_snr, ssim, ssim_range_jy_per_pixel, snr_at_scale → {arcsec → dB}}} and
         `similarity` → weighting → {'one|other' → S in dB}; what could not be measured is left out.
     versions : dict

@@ -74,6 +74,8 @@ def measure(products, cell_arcsec, beams, truth, support, regions, chi_square=No
         if product.name in chi_square and "natural" in entry:
             entry["natural"]["chi_square"] = [float(value) for value in chi_square[product.name]]
         entry["regions"] = {name: _region(product, mask, cell_arcsec, beams) for name, mask in regions.items()}
+        for name, error in product.region_errors.items():
+            entry["regions"][name]["model_error_jy"] = error
         if truth is not None:
             entry |= _against_truth(product, truth, cell_arcsec, beams)
         measured[product.name] = entry

@@ -12,8 +12,9 @@ WEIGHTINGS = ("natural", "briggs")
 
 
 REGION_TABLES = (
-    ("model_flux_jy", "Regions, flux of the models", "Sum of the model within each region."),
-    ("flux_jy", "Regions, flux of the restored images",
+    ("model_flux_jy", "model_error_jy", "Regions, flux of the models",
+     "Sum of the model within each region; the error is that of the draws of tsara's ndraws."),
+    ("flux_jy", "error_jy", "Regions, flux of the restored images",
      "Within each region; a region smaller than the beam holds a part of its source. The error is that of the noise."),
 )
 
@@ -90,8 +91,8 @@ def _blocks(measured):
     return build("χ² of the blocks", columns, entries, caption)
 
 
-def _regions(measured, key, title, caption):
-    """Flux in every region; `key` is that of the models, or of the restored images with its error."""
+def _regions(measured, key, error, title, caption):
+    """Flux in every region; `key` and `error` are those of the models, or of the restored images."""
     found = {
         name: {region: entry for region, entry in one.get("regions", {}).items() if key in entry}
         for name, one in measured.items()
@@ -102,7 +103,6 @@ def _regions(measured, key, title, caption):
     rows = []
     for region in regions:
         entries = [one.get(region, {}) for one in found.values()]
-        error = "error_jy" if key == "flux_jy" else ""
         rows.append((region, *(_with_error(entry.get(key), entry.get(error)) for entry in entries)))
     return Table(title, ("", *measured), ("", *["Jy"] * len(measured)), tuple(rows), caption)
 

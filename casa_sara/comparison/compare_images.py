@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -26,6 +27,7 @@ from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
 from casa_sara.reconstruction.compile_cache import kernels_loading
+from casa_sara.reconstruction.draws import read_draws
 from casa_sara.version import __version__
 
 __all__ = ["compare_images"]
@@ -86,6 +88,8 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         beams, residuals, chi_square = *_beside(sets, plane, notes), {}
     # measure
     products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
+    products = tuple(replace(product, region_errors=_region_errors(one, plane, regions))
+                     for product, one in zip(products, sets))
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
     if injected:
@@ -186,6 +190,19 @@ def _product(one, model, residuals, beams, cell_arcsec):
         smoothed = metrics.smooth(model, axes, angle, cell_arcsec) * metrics.beam_pixels(axes, cell_arcsec)
         restored[weighting] = smoothed + residual
     return Product(one.name, model, residuals, restored, dict(one.parameters), dict(one.record))
+
+
+def _region_errors(one, plane, regions):
+    """Return the errors of the flux of a model in each region, Jy by name, from its draws; empty where there are none."""
+    if not one.draws or not regions:
+        return {}
+    draws = read_draws(one.draws)
+    if draws.shape != one.model.pixels.shape:
+        raise ValueError(f"models: '{one.draws}' is of an image of {draws.shape[0]} x {draws.shape[1]} pixels, '{one.model.name}' "
+                         f"has {one.model.pixels.shape[0]} x {one.model.pixels.shape[1]}: should be of one run of tsara")
+    masks = np.array(list(regions.values())).reshape(len(regions), -1).astype(float)
+    errors = draws.error(lambda difference: masks @ replace(one.model, pixels=difference).flux_on(plane).ravel())
+    return dict(zip(regions, errors.tolist()))
 
 
 def _support(request, plane, frame, models, truth, beam, notes):

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["FEWEST", "Draws"]
+__all__ = ["FEWEST", "Draws", "read_draws"]
 
 FEWEST = 2  # draws of which an error is taken
 LARGEST = 3e4  # of a difference as a 16-bit number: its largest is 65504
@@ -114,8 +115,39 @@ class Draws:
 
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray]) -> Draws:
-        """Make it of what :meth:`arrays` has returned."""
+        """Make it of what :meth:`arrays` has returned; raise ValueError where these do not fit together."""
+        if not arrays["counts"].sum() == arrays["pixels"].size == arrays["values"].size:
+            raise ValueError("its arrays do not fit together")
         places = np.cumsum(arrays["counts"])[:-1]
         parts = {name: [np.array(part) for part in np.split(arrays[name], places)] if len(arrays["scales"]) else []
                  for name in ("pixels", "values")}
         return cls(tuple(int(n) for n in arrays["shape"]), int(arrays["asked"]), **parts, scales=arrays["scales"].tolist())
+
+
+def read_draws(path: str) -> Draws:
+    """Read the file of draws that tsara writes with its images.
+
+    Parameters
+    ----------
+    path : str
+
+    Returns
+    -------
+    Draws
+
+    Raises
+    ------
+    ValueError
+        It is no such file, or damaged.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            draws = Draws.of({name: arrays[name] for name in arrays.files})
+        size = draws.shape[0] * draws.shape[1]
+        good = len(draws.pixels) == len(draws) >= FEWEST and all(
+            pixels.min(initial=0) >= 0 and pixels.max(initial=0) < size for pixels in draws.pixels)
+    except (OSError, EOFError, KeyError, TypeError, IndexError, ValueError, zipfile.BadZipFile) as error:
+        raise ValueError(f"models: '{path}' cannot be read as the draws of a model: {error}") from error
+    if not good:
+        raise ValueError(f"models: '{path}' cannot be read as the draws of a model: its arrays do not fit together")
+    return draws

@@ -153,8 +153,8 @@ class _saracompare:
     -------
     dict
       'products' holds for each name flux_jy, peak_jy_per_pixel, negative_jy, mdr (dynamic range of
-      the model), regions (flux_jy, error_jy, model_flux_jy of each) and, for natural and briggs
-      weights, sigma, peak, dr (peak of the restored image over the standard deviation of the
+      the model), regions (flux_jy, error_jy, model_flux_jy of each, and model_error_jy where tsara
+      had ndraws) and, for natural and briggs weights, sigma, peak, dr (peak of the restored image over the standard deviation of the
       residual), max_abs, skewness, kurtosis, whiteness and chi_square of each snapshot; with a
       truth also snr, log_snr, ssim with its range, and snr_at_scale (in dB, by the beam in arcsec),
       and fwhm_recovered_arcsec where the truth has a point source; with inject, 'injected' of each

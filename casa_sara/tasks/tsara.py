@@ -544,10 +544,11 @@ class _tsara:
       user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit,
       108 converged but the residual is not noise (more than 5 sigma over a beam or more).
       The key 'sara' holds its own record: the islands of emission ('islands': place, flux with its
-      error, S/N, size; with ndraws bootstrap_error_jy, the error that the draws give), the largest S/N of the residual by width ('residual_snr'), the noise and
-      bound of each block with its snapshot ('blocks'), the history of re-weightings and iterations,
-      the parameters that were chosen automatically and why, how many samples were left out for which
-      reason ('dropped'), and the iterations from which the run was resumed ('resumed').
+      error, S/N, size; with ndraws bootstrap_error_jy, the error that the draws give), the largest
+      S/N of the residual by width ('residual_snr'), the noise and bound of each block with its
+      snapshot ('blocks'), the history of re-weightings and iterations, the parameters that were
+      chosen automatically and why, how many samples were left out for which reason ('dropped'), and
+      the iterations from which the run was resumed ('resumed').
 
     Examples
     --------
