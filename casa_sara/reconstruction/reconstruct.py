@@ -54,12 +54,15 @@ class Control:
         whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
     drawn : callable
         Called with the `Draws` before the first draw of the bootstrap, and after each.
+    then : callable, optional
+        Called at the end with the iteration, its bounds and its record, all as the solution has left them.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
     stopped: Callable[[], bool] = lambda: False
     checkpoint: Checkpoint | None = None
     drawn: Callable[[Draws], None] = lambda draws: None
+    then: Callable[[AdaptivePPD, Any, SolverRecord], None] | None = None
 
 
 @dataclass
@@ -163,7 +166,9 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     if solution.result is None:
         record = _iterate(solution, options, control, layout, ranks)
         _begin_draws(solution, record, options)
-        solution.result = _result(solution, record, samples, comm)
+        solution.result = _result(solution, record, samples, comm, control.then is not None)
+        if control.then:
+            control.then(solution.ppd, solution.bounds, record)
     if solution.bootstrap is not None:
         _draw(solution, control, layout, ranks)
     return solution.result
@@ -227,11 +232,11 @@ def _keep(solution, checkpoint, layout, ranks, stage, now):
         comm.once(checkpoint.keep, lambda: state, iteration, now=True)
 
 
-def _result(solution, record, samples, comm):
-    """Return what was found, in Jy."""
+def _result(solution, record, samples, comm, goes_on):
+    """Return what was found, in Jy; the iteration keeps its model where it `goes_on`."""
     found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
     bootstrap = solution.bootstrap
-    model = bootstrap.model.copy() if bootstrap else comm.own(ppd.model)
+    model = ppd.model.copy() if bootstrap or goes_on else comm.own(ppd.model)
     if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
