@@ -180,4 +180,5 @@ class Comparing:
     frames: tuple[str, ...] = ()
     inject: tuple[str, ...] = ()
     injectflux: float = 0.0
+    features: tuple[str, ...] = ()
     nthreads: int = 1

@@ -257,3 +257,20 @@ def test_draws_of_another_image_and_damaged_ones_are_refused(vis, folder):
             file.write(content)
         with pytest.raises(ValueError, match="models: '.*other.draws.npz' cannot be read"):
             region_of(vis, folder / "other", folder / "one")
+
+
+# features of saracompare
+
+def test_a_source_is_real_and_nothing_is_not(whole, vis, folder):
+    features = ["third = 19h59m28.588s +40d44m03.5s 3arcsec", "nothing = 19h59m28.1s +40d43m48s 3arcsec"]
+    found = saracompare(models=[str(folder / "whole"), str(folder / "plain")], vis=vis, datacolumn="data", features=features,
+                        outdir=str(folder / "compared"), overwrite=True)["products"]
+    for name in ("whole", "plain"):  # the same run, with draws and without
+        real, nothing = (found[name]["features"][feature] for feature in ("third", "nothing"))
+        assert real["flux_jy"] == pytest.approx(0.3, abs=0.03) and real["sigma"] > 10 and len(real["drawn"]) == 20
+        assert real["delta_chi_square"] == pytest.approx((0.3 / whole[0]["sara"]["chosen"]["noise_jy_per_beam"]) ** 2, rel=0.2)
+        assert nothing["p_value"] > 1e-3 and nothing["delta_chi_square"] < 30
+    page = (folder / "compared" / "report.html").read_text()
+    assert "Is it real?" in page and "whole, third" in page and "Errors, natural beam" in page
+    for name in ("errors_natural.png", "errors_briggs.png", "features.png"):
+        assert (folder / "compared" / name).stat().st_size > 20_000

@@ -69,6 +69,9 @@ def test_probabilities_are_those_of_the_scaled_chi_square_of_the_draws():
         assert found.p_value == pytest.approx(expected, rel=1e-9)
         if change > 0:
             assert found.sigma == pytest.approx(norm.isf(expected), rel=1e-9)
+    shifted = FeatureResult(2.5 - 4, drawn - 4, 0.0, empty, empty)  # begins at −3
+    least = -3.0
+    assert shifted.p_value == pytest.approx(chi2.sf((-1.5 - least) * 2 * (mean - 1) / variance, 2 * (mean - 1) ** 2 / variance))
     assert FeatureResult(2.5, drawn, 0.0, empty, empty).rank_p_value == 3 / 5
     assert FeatureResult(1.0, np.zeros(4), 0.0, empty, empty).p_value == 1 / 5
     assert 30 < FeatureResult(1e5, drawn, 0.0, empty, empty).sigma < 40

@@ -76,6 +76,8 @@ def measure(products, cell_arcsec, beams, truth, support, regions, chi_square=No
         entry["regions"] = {name: _region(product, mask, cell_arcsec, beams) for name, mask in regions.items()}
         for name, error in product.region_errors.items():
             entry["regions"][name]["model_error_jy"] = error
+        if product.features:
+            entry["features"] = {name: dict(test[0]) for name, test in product.features.items()}
         if truth is not None:
             entry |= _against_truth(product, truth, cell_arcsec, beams)
         measured[product.name] = entry

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 
 import numpy as np
@@ -21,6 +22,7 @@ from casa_sara.casa.images.spectral_index import with_spectrum
 from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.ms.weights import dirty_image, imaging_weights
 from casa_sara.casa.runtime import log
+from casa_sara.comparison.features import measures_of, test_features
 from casa_sara.comparison.injection import Injection, can_be_repeated, recover, spectral_index_of
 from casa_sara.data.blocks import snapshot_blocks
 from casa_sara.operators.sky import sky_operator
@@ -79,6 +81,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     frame = _frame(plane)
     regions = region_masks(request.regions, frame)
     injected = _places_to_inject(request, frame, sets, observed)
+    features, of_features = _features(request, sets, observed), region_masks(request.features, frame, "features")
     # one operator
     if observed:
         notes.extend(_other_data(sets, selection))
@@ -88,8 +91,8 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         beams, residuals, chi_square = *_beside(sets, plane, notes), {}
     # measure
     products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
-    products = tuple(replace(product, region_errors=_region_errors(one, plane, regions))
-                     for product, one in zip(products, sets))
+    products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec),
+                             features=_tested(one, features, of_features, plane, request, selection)) for product, one in zip(products, sets))
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
     if injected:
@@ -192,17 +195,47 @@ def _product(one, model, residuals, beams, cell_arcsec):
     return Product(one.name, model, residuals, restored, dict(one.parameters), dict(one.record))
 
 
-def _region_errors(one, plane, regions):
-    """Return the errors of the flux of a model in each region, Jy by name, from its draws; empty where there are none."""
-    if not one.draws or not regions:
+def _features(request, sets, observed):
+    """Return the regions to test, by product and name, on the product's own pixels; raise where no run can be repeated."""
+    again = [one for one in sets if observed and can_be_repeated(one)]
+    if request.features and not again:
+        raise ValueError(f"features = {list(request.features)}: needs vis, and images of tsara with their history among models; "
+                         "images of other imagers cannot be made again")
+    return {one.name: region_masks(request.features, _frame(one.model.plane.upright()), "features") for one in again}
+
+
+def _tested(one, features, masks, plane, request, selection):
+    """Return the tests of a product's features: name → measures, the models with and without it, and its mask, on the common grid."""
+    if not features.get(one.name):
+        return {}
+    own = one.model.upright()
+    return {name: (measures_of(result), *(replace(own, pixels=model).flux_on(plane) for model in (result.with_, result.without)),
+                   masks[name])
+            for name, result in test_features(one, features[one.name], selection, request.nthreads).items()}
+
+
+def _errors(one, plane, regions, beams, cell_arcsec):
+    """Return the errors that a product's draws give: of the model, of the smoothed model and of regions; none without draws."""
+    if not one.draws:
         return {}
     draws = read_draws(one.draws)
     if draws.shape != one.model.pixels.shape:
         raise ValueError(f"models: '{one.draws}' is of an image of {draws.shape[0]} x {draws.shape[1]} pixels, '{one.model.name}' "
                          f"has {one.model.pixels.shape[0]} x {one.model.pixels.shape[1]}: should be of one run of tsara")
-    masks = np.array(list(regions.values())).reshape(len(regions), -1).astype(float)
-    errors = draws.error(lambda difference: masks @ replace(one.model, pixels=difference).flux_on(plane).ravel())
-    return dict(zip(regions, errors.tolist()))
+
+    def on_plane(difference):
+        return replace(one.model, pixels=difference).flux_on(plane)
+
+    def fluxes(difference):
+        flux = on_plane(difference)
+        return np.array([flux[mask].sum() for mask in regions.values()])
+
+    def smoothed(difference, major, minor, angle):
+        return metrics.smooth(on_plane(difference), (major, minor), angle, cell_arcsec)
+
+    return dict(model_error=draws.error(on_plane), region_errors=dict(zip(regions, draws.error(fluxes).tolist())),
+                smoothed_error={name: draws.error(partial(smoothed, major=beam[0], minor=beam[1], angle=beam[2]))
+                                for name, beam in beams.items()})
 
 
 def _support(request, plane, frame, models, truth, beam, notes):

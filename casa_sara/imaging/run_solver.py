@@ -81,7 +81,8 @@ def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid,
 
 
 def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
-                watch: Watch | None = None, support: np.ndarray | None = None, ranks: RankAssignment = ALONE) -> Reconstruction:
+                watch: Watch | None = None, support: np.ndarray | None = None, ranks: RankAssignment = ALONE,
+                then: Callable[..., None] | None = None) -> Reconstruction:
     """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
 
     Parameters
@@ -98,6 +99,8 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         The model is 0 elsewhere.
     ranks : casa_sara.parallel.partition.RankAssignment
         The ranks that share the work; rank 0 decides when to stop.
+    then : callable, optional
+        Called at the end with what tells whether to stop, and as `Control.then`.
 
     Returns
     -------
@@ -111,7 +114,8 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
             preparing()
             return bool(ranks.comm.bcast_numbers([pressed() or bool(watch and watch.deadline.near())])[0])
 
-        control = Control(report, stopped, watch.checkpoint if watch else None, _Drawing(progress, preparing))
+        control = Control(report, stopped, watch.checkpoint if watch else None, _Drawing(progress, preparing),
+                          then and partial(then, stopped))
         if not (control.checkpoint and control.checkpoint.state is not None):
             progress.prepare("computing the norm of the measurement operator, and the first image by non-negative least squares "
                              f"(NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")

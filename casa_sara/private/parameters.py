@@ -24,6 +24,7 @@ SARACOMPARE = (
     Parameter('threshold', ('double',), 0.001, 'The support is what exceeds this fraction of the peak', minimum=0.0, maximum=1.0),
     Parameter('inject', ('string', 'stringVec'), [], 'Where to inject point sources, to measure the resolution; []: nowhere'),
     Parameter('injectflux', ('double',), 0.0, 'Flux of each injected source in Jy; 0: 100 times the noise per beam', minimum=0.0),
+    Parameter('features', ('string', 'stringVec'), [], 'Regions with structures of which to test whether they are real; []: none'),
     Parameter('frames', ('string', 'stringVec'), [], 'Images of an animation in the report, in the order to show them'),
     Parameter('overwrite', ('bool',), False, 'Write into a folder that holds files'),
 )

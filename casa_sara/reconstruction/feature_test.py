@@ -52,12 +52,14 @@ class FeatureResult:
     def p_value(self) -> float:
         """Probability of a T not less than this without emission, of the scaled χ² with the mean and variance of the draws.
 
-        It is what lets a few draws tell of far smaller probabilities than one in their number, by extrapolation.
+        It is what lets a few draws tell of far smaller probabilities than one in their number, by extrapolation; no less than
+        1e-300.  The prior may let T be negative: the distribution then begins at the least of the draws.
         """
-        mean, variance = float(np.mean(self.drawn)), float(np.var(self.drawn, ddof=1))
+        least = min(float(np.min(self.drawn)), 0.0)
+        mean, variance = float(np.mean(self.drawn)) - least, float(np.var(self.drawn, ddof=1))
         if not (mean > 0 and variance > 0):
             return self.rank_p_value
-        return max(float(gammaincc(mean**2 / variance, max(self.change, 0.0) * mean / variance)), LEAST_P)
+        return max(float(gammaincc(mean**2 / variance, max(self.change - least, 0.0) * mean / variance)), LEAST_P)
 
     @property
     def sigma(self) -> float:
