@@ -64,23 +64,26 @@ def _numbered(product, comparison):
 
 def features(path, comparison) -> bool:
     """Draw the models with and without emission in each region that was tested; tell whether there was any."""
-    rows = [(f"{product.name}, {name}: {test[0]['sigma']:.2g} σ", *test[1:])
+    rows = [(f"{product.name}, {name}: {test[0]['sigma']:.2g} σ, p = {test[0]['p_value']:.2g}", *test[1:])
             for product in comparison.products for name, test in product.features.items()]
     if not rows:
         return False
-    cell = comparison.cell_arcsec
+    cell, pixel = comparison.cell_arcsec, float(np.prod(comparison.cell_arcsec))
+    top = max(float(with_.max()) for _, with_, _, _ in rows) / pixel
+    factor, sign = prefix(top)
+    norm = LogNorm(top * factor * 10**-DECADES, top * factor)
     sheet = Sheet([row[0] for row in rows], ["with", "without", "without − with"], 1.0, widest=2.75)
     for row, (_, with_, without, mask) in enumerate(rows):
-        change, box = without - with_, _around(mask)
-        top = float(np.max(np.maximum(with_, without)[box])) / float(np.prod(cell)) or 1.0
-        factor, sign = prefix(top)
-        norm, change_norm = LogNorm(top * factor * 10**-DECADES, top * factor), Normalize(-top * factor, top * factor)
-        for column, image in enumerate((with_, without, change)):
+        change, box = (without - with_) / pixel, _around(mask)
+        reach = float(np.abs(change[box]).max()) or 1.0
+        own, own_sign = prefix(reach)
+        for column, image in enumerate((with_ / pixel * factor, without / pixel * factor, change * own)):
             panel = sheet.panel(row, column)
-            draw(panel, image[box] / np.prod(cell) * factor, change_norm if column == 2 else norm, cell,
+            draw(panel, image[box], Normalize(-reach * own, reach * own) if column == 2 else norm, cell,
                  DIFFERENCE_MAP if column == 2 else BRIGHTNESS_MAP)
             panel.contour(mask[box].T, levels=[0.5], colors="#56B4E9", linewidths=0.8)
-        panel.set_xlabel(plain(f"±{top * factor:.3g} {sign}Jy arcsec⁻²"), fontsize=8)
+        panel.set_xlabel(plain(f"±{reach * own:.3g} {own_sign}Jy arcsec⁻²"), fontsize=8)
+    sheet.bar(0, 1, norm, BRIGHTNESS_MAP, f"{sign}Jy arcsec$^{{-2}}$")
     sheet.save(path)
     return True
 

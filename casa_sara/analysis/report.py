@@ -133,7 +133,7 @@ def _errors(comparison, folder) -> list[Picture]:
     path = folder / "features.png"
     if error_pages.features(path, comparison):
         made.append(Picture(path, "sky", "Is it real?", "Models with emission free in the region, and without any there, on one "
-                            "scale for each row; the table has the probabilities."))
+                            "scale, and their difference on its own; the table has the probabilities."))
     return made
 
 
