@@ -129,6 +129,7 @@ class SolverOptions:
     regscale: float = 1.0
     significance: float = 5.0
     ndraws: int = 0
+    jackknife: bool = False
     nthreads: int = 1
 
 

@@ -6,7 +6,7 @@ from dense_problem import Problem
 from test_checkpoint import GRID, OPTIONS, assert_same, sky  # noqa: F401  # a fixture
 
 from casa_sara.options import SolverOptions
-from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, SEED, Bootstrap
+from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, SEED, Bootstrap, Jackknife
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.draws import Draws
 from casa_sara.reconstruction.problem import Samples
@@ -20,9 +20,9 @@ NDRAWS = 400
 UNIT_JY = 3.0
 
 
-def drawn_from_dense_problem(ndraws):
+def drawn_from_dense_problem(ndraws, kind=Bootstrap, samples=(60, 80), noise=(0.05, 0.15)):
     """Draw a least-squares image, without positivity and without prior; return the problem, 1/σ² of its samples and the draws."""
-    problem = Problem(seed=3, samples=(60, 80), noise=(0.05, 0.15))
+    problem = Problem(seed=3, samples=samples, noise=noise)
     ppd = AdaptivePPD(problem.measurement, problem.dictionary, problem.vis, problem.offsets, problem.precond,
                       problem.data_norm_sq(problem.precond), positivity=False)
     weights = np.abs(problem.measurement.matrix[:, 0]) ** 2
@@ -36,7 +36,7 @@ def drawn_from_dense_problem(ndraws):
     for _ in range(500):
         ppd.step()
     draws = Draws(problem.shape, ndraws)
-    Bootstrap(ppd, bounds, None, 0.0, ppd.model.copy(), ppd.threshold, draws).run(
+    kind(ppd, bounds, None, 0.0, ppd.model.copy(), ppd.threshold, draws).run(
         lambda: False, lambda draws: None, lambda now: None)
     return problem, np.repeat(np.array(problem.noise) ** -2.0, samples), draws
 
@@ -69,6 +69,22 @@ def test_every_draw_is_the_solution_of_its_data():
         expected = UNIT_JY * np.linalg.solve(information, (matrix.conj().T @ (noise_weights * noise)).real)
         error = np.linalg.norm(difference.ravel() - expected) / np.linalg.norm(expected)
         assert error < 0.01, number
+
+
+def test_every_solution_of_a_jackknife_lacks_its_blocks():
+    """√(g − 1)(x_k − x̂), with x_k and x̂ of least squares; six blocks in four groups."""
+    problem, noise_weights, draws = drawn_from_dense_problem(4, Jackknife, (30, 40, 50, 60, 70, 80), (0.05, 0.1, 0.05, 0.1, 0.05, 0.1))
+    matrix, block = problem.measurement.matrix, np.repeat(np.arange(6), problem.samples)
+
+    def least_squares(used):
+        weights = noise_weights * used
+        information = (matrix.conj().T @ (weights[:, None] * matrix)).real
+        return UNIT_JY * np.linalg.solve(information, (matrix.conj().T @ (weights * problem.vis)).real)
+
+    assert len(draws) == 4
+    for group, difference in enumerate(draws.differences()):
+        expected = np.sqrt(3) * (least_squares(block % 4 != group) - least_squares(block >= 0))
+        assert np.linalg.norm(difference.ravel() - expected) < 0.02 * np.linalg.norm(expected), group
 
 
 def some_draws(number=6):
@@ -125,10 +141,10 @@ def test_islands_have_the_errors_of_their_surroundings():
         difference[4, 4], difference[6, 4] = size, size  # one pixel of the first island, and one beside it
         difference[14, 15] = -size
         draws.add(difference)
-    add_flux_errors(islands, model, draws.flux_errors)
+    add_flux_errors(islands, model, draws.flux_errors, "bootstrap_error_jy")
     rms = np.sqrt((3.0**2 + 4.0**2) / 2)
     np.testing.assert_allclose([island["bootstrap_error_jy"] for island in islands], [rms, 2 * rms], rtol=1e-3)
-    add_flux_errors([], np.zeros((20, 20)), draws.flux_errors)
+    add_flux_errors([], np.zeros((20, 20)), draws.flux_errors, "x")
 
 
 # within a reconstruction
@@ -153,7 +169,7 @@ def image(sky, path="", stop_in=None, options=WITH_DRAWS["options"]):
 
     samples = Samples(data, offsets, np.ones(data.size), np.array([1.0, np.nan]))
     return reconstruct(samples, GRID, options, control=Control(
-        stopped=stopped, checkpoint=checkpoint, drawn=lambda draws: drawing or drawing.append(0)))
+        stopped=stopped, checkpoint=checkpoint, drawn=lambda name, draws: drawing or drawing.append(0)))
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from simulated_ms import pixels, simulate
+from simulated_ms import column, edit, pixels, simulate
 
 pytest.importorskip("casatools")
 
@@ -131,9 +131,9 @@ def interrupted(vis, name, iterations, **changes):
     begun, done = [], []
 
     class Counted(drawing):
-        def __call__(self, draws):
+        def __call__(self, name, draws):
             begun.append(1)
-            super().__call__(draws)
+            super().__call__(name, draws)
 
     @contextlib.contextmanager
     def pressed_late():
@@ -150,7 +150,7 @@ def test_an_end_in_the_middle_of_the_draws_keeps_those_made_and_a_restart_makes_
     name = folder / "stopped"
     result, lines = interrupted(vis, name, 2 * DRAW_ITERATIONS + 33)
     assert result["sara"]["draws"] == dict(asked=NDRAWS, made=2) and result["stopcode"] == CONVERGED
-    assert any(line.startswith("WARN 2 draws of 4 were made") and f"restart = True makes the others, from '{name}.checkpoint'"
+    assert any(line.startswith("WARN 2 of 4 draws were made") and f"restart = True makes the others, from '{name}.checkpoint'"
                in line for line in lines)
     np.testing.assert_allclose(pixels(f"{name}.model.error"), kept_draws(name).error(), rtol=1e-6)
     result, _ = image(vis, name, restart=True)
@@ -194,7 +194,40 @@ def test_a_restoring_beam_that_is_asked_for_is_that_of_the_errors(vis, folder):
 def test_what_has_no_errors_is_refused(vis, folder, changes):
     with pytest.raises(ValueError, match=f"ndraws = {changes.get('ndraws', NDRAWS)}"):
         image(vis, folder / "refused", **changes)
+    if "ndraws" not in changes:
+        with pytest.raises(ValueError, match="jackknife = True"):
+            image(vis, folder / "refused", **changes | dict(ndraws=0, jackknife=True))
     assert not list(folder.glob("refused*"))
+
+
+def test_a_jackknife_is_an_image_and_an_error_of_islands(vis, folder):
+    name = folder / "jack"
+    result, lines = image(vis, name, jackknife=True, ndraws=2)
+    assert result["sara"]["jackknife"] == dict(groups=4, made=4) and any("jackknife: group 4 of 4" in line for line in lines)
+    unit, beam, masks, _ = header(f"{name}.image.jackknife")
+    assert unit == "Jy/beam" and (beam, masks) == header(f"{name}.image")[1:3]
+    island = result["sara"]["islands"][0]
+    assert 0 < island["jackknife_error_jy"] < 0.1 and island["bootstrap_error_jy"] > 0
+    assert any("by the jackknife over snapshots are" in line for line in lines)
+    np.testing.assert_array_equal(pixels(f"{name}.model"), pixels(folder / "whole.model"))
+    image(vis, name, ndraws=0, overwrite=True)
+    assert not os.path.exists(f"{name}.image.jackknife")
+    with pytest.raises(ValueError, match="jackknife = True: there are 2 blocks"):
+        image(vis, folder / "refused", jackknife=True, blocks=2)
+
+
+def test_gain_errors_show_in_the_jackknife_and_little_in_the_draws(folder):
+    """A bright source whose amplitude is wrong by 5 % in each scan."""
+    name = str(simulate(folder / "gains.ms", configuration="c", antennas=14, sky=[(1.0, 2 * ARCSEC, 1 * ARCSEC)], noise=0.05,
+                        scans=8, integration=20.0, spacing_seconds=2700.0, hour_angle=-2.5, seed=4))
+    scans = column(name, "SCAN_NUMBER")
+    gains = 1 + 0.05 * np.random.default_rng(3).standard_normal(scans.max() + 1)
+    edit(name, "DATA", lambda data: data * gains[scans])
+    result, lines = image(name, folder / "gains", jackknife=True, ndraws=5)
+    island = result["sara"]["islands"][0]
+    assert island["jackknife_error_jy"] > 2 * island["bootstrap_error_jy"]
+    assert 0.3 * 0.05 / np.sqrt(8) < island["jackknife_error_jy"] < 2 * 0.05 / np.sqrt(8)
+    assert any(line.startswith("WARN errors of the fluxes of islands by the jackknife") for line in lines)
 
 
 def test_a_dry_run_tells_what_the_draws_take(vis, folder):
@@ -202,10 +235,10 @@ def test_a_dry_run_tells_what_the_draws_take(vis, folder):
     without, _ = image(vis, folder / "dry", dryrun=True, ndraws=0)
     seconds = found["forecast"]["seconds"]
     assert seconds["drawing"] == pytest.approx(NDRAWS * (DRAW_ITERATIONS + 8) * seconds["iteration"])
-    assert any("4 draws of the bootstrap" in line for line in lines) and without["forecast"]["seconds"]["drawing"] == 0
+    assert any("4 draws for the errors" in line for line in lines) and without["forecast"]["seconds"]["drawing"] == 0
     memory = [one["forecast"]["memory_bytes"] for one in (found, without)]
-    assert "draws" in memory[0]["bootstrap"] and "bootstrap" not in memory[1]
-    assert memory[0]["bootstrap"]["draws"] == int(4 * (1.5 * 4 * 0.3) * 72**2) + 4 * 2 * 72**2
+    assert "draws" in memory[0]["drawing"] and "drawing" not in memory[1]
+    assert memory[0]["drawing"]["draws"] == int(4 * (1.5 * 4 * 0.3) * 72**2) + 4 * 2 * 72**2
 
 
 # regions of saracompare

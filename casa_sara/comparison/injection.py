@@ -161,7 +161,7 @@ def _options(parameters, nthreads) -> SolverOptions:
     """Return the solver options in a history; others have their defaults."""
     given = {field.name: _value(parameters[field.name], field.default)
              for field in fields(SolverOptions) if field.name in parameters}
-    return SolverOptions(**given | {"nthreads": nthreads, "ndraws": 0})
+    return SolverOptions(**given | {"nthreads": nthreads, "ndraws": 0, "jackknife": False})
 
 
 def _blocks(text):

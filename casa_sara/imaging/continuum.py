@@ -258,7 +258,7 @@ def _solve(request, plane, part, watch):
     if options.niter == 0:
         return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
     watch.deadline.reserve = _after_iterations(comm.total(data.size), grid, request.output, request.limits,
-                                               watch.deadline.elapsed()) + error_seconds(options.ndraws, grid.shape)
+                                               watch.deadline.elapsed()) + error_seconds(options, grid.shape)
     samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise)
     found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, ranks)
     list_islands(found.record, plane.image_plane, grid.cell_rad, options.significance, comm)
@@ -283,10 +283,10 @@ def _look_back(images, plane, solution, comm):
 
 def _write(request, plane, images, reconstruction, record, child):
     """Write the products, with the errors that the draws give."""
-    draws = reconstruction.draws if reconstruction else None
-    errors = error_images(draws, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
+    draws, jackknife = (reconstruction.draws, reconstruction.jackknife) if reconstruction else (None, None)
+    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
     write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child,
-                   draws.arrays() if errors else None)
+                   draws.arrays() if "model.error" in errors else None)
 
 
 def split(data, blocks, comm=SERIAL):

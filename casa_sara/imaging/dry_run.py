@@ -133,7 +133,7 @@ def _time_lines(timing):
            "the data)")
     rows = {"reading": timing.reading, "building the operator": timing.building,
             "one NNLS iteration": timing.nnls_iteration, "one solver iteration": timing.iteration,
-            **({f"{timing.draws} draws of the bootstrap": timing.drawing} if timing.draws else {}),
+            **({f"{timing.draws} draws for the errors": timing.drawing} if timing.draws else {}),
             "writing the images": timing.writing}
     for name, seconds in rows.items():
         yield f"  {name:<26}{seconds:10.3f} s"

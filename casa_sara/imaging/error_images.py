@@ -14,13 +14,13 @@ __all__ = ["error_images"]
 ARCSEC = np.radians(1 / 3600)
 
 
-def error_images(draws: Draws | None, fitted: dict, restoringbeam: tuple[str, ...] | None,
+def error_images(draws: Draws | None, jackknife: Draws | None, fitted: dict, restoringbeam: tuple[str, ...] | None,
                  cell_rad: tuple[float, float]) -> dict[str, np.ndarray]:
-    """Return the error of the model, and that of the model smoothed to the restoring beam.
+    """Return the error of the model, and those of the model smoothed to the restoring beam.
 
     Parameters
     ----------
-    draws : Draws or None
+    draws, jackknife : Draws or None
     fitted : dict
         Beam of the PSF, of :func:`casa_sara.casa.images.restore.fit_beam`.
     restoringbeam : tuple of str or None
@@ -31,15 +31,15 @@ def error_images(draws: Draws | None, fitted: dict, restoringbeam: tuple[str, ..
     Returns
     -------
     dict
-        'model.error' in Jy/pixel and, where there is a restored image, 'image.error' in Jy/beam, float32 (nx, ny); empty with
-        fewer than two draws.
+        'model.error' in Jy/pixel and, where there is a restored image, 'image.error' and 'image.jackknife' in Jy/beam, float32
+        (nx, ny); those of which there are two draws or more.
     """
-    if draws is None or len(draws) < FEWEST:
-        return {}
-    errors = {"model.error": draws.error()}
-    if restoringbeam is not None:
+    drawn = {name: one for name, one in (("error", draws), ("jackknife", jackknife)) if one is not None and len(one) >= FEWEST}
+    errors = {"model.error": draws.error()} if "error" in drawn else {}
+    if restoringbeam is not None and drawn:
         *axes, angle = beam_numbers(restored_beam(list(restoringbeam), fitted))
         cell = tuple(size / ARCSEC for size in cell_rad)
         per_beam = beam_pixels(axes, cell)
-        errors["image.error"] = draws.error(lambda difference: per_beam * smooth(difference, axes, angle, cell))
+        errors |= {f"image.{name}": one.error(lambda difference: per_beam * smooth(difference, axes, angle, cell))
+                   for name, one in drawn.items()}
     return errors

@@ -9,6 +9,7 @@ from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
 from casa_sara.operators.sky import further_bytes
 from casa_sara.parallel.partition import ALONE
+from casa_sara.reconstruction.bootstrap import MOST_GROUPS
 
 __all__ = ["Forecast", "Workload", "forecast"]
 
@@ -61,7 +62,7 @@ class Workload:
     masked: bool = False
     whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
     confined: bool = False
-    draws: int = 0  # of the bootstrap
+    draws: int = 0  # of bootstrap and jackknife
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
 
     @classmethod
@@ -72,7 +73,8 @@ class Workload:
                    len(ranks.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
                    options.precondition, report and writes, grid.gridder, volume.max_w, bool(grid.spectralindex), band,
                    channels, share, grid.masked, (volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
-                   options.method == "tsara" and options.significance > 0 and options.nreweights > 0, options.ndraws,
+                   options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
+                   options.ndraws + options.jackknife * MOST_GROUPS,
                    3 if options.method == "dabbech2018" else 2)
 
     def memory(self):
@@ -125,7 +127,7 @@ class Workload:
         phases["NNLS"] = with_solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
         phases["iterating"] = iterating
         if self.draws:
-            phases["bootstrap"] = iterating | {"draws": self._drawn() + self._planes(2)}
+            phases["drawing"] = iterating | {"draws": self._drawn() + self._planes(2)}
         if any(self.whole):
             samples, bases = self.whole
             duals_and_weights = 2 * coefficient_bytes(self.shape, bases, self.levels)[0]

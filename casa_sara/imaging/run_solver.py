@@ -20,7 +20,7 @@ from casa_sara.imaging.time_forecast import Pace
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
-from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS
+from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, MOST_GROUPS
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.draws import FEWEST
 from casa_sara.reconstruction.problem import Samples
@@ -35,6 +35,7 @@ from casa_sara.version import __version__
 __all__ = ["Watch", "checkpoint_of", "density_of", "expected_iterations", "list_islands", "solve_image", "without_wild"]
 
 MOST_NAMED = 20  # wild samples that the log names one by one
+DIFFER = 2.0  # times: errors of jackknife and bootstrap that do not agree
 MOST_TOLD = 20  # islands of emission that the log lists
 
 
@@ -125,13 +126,15 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     if record.stop_code == STOPPED_BY_USER and not ranks.comm.bcast(pressed()):
         record.stop_code = TIME_LIMIT
     _log_end(reconstruction, samples.offsets, control.checkpoint, ranks.comm)
-    _log_draws(reconstruction, control.checkpoint)
+    for draws, what in ((reconstruction.jackknife, "groups of the jackknife"), (reconstruction.draws, "draws")):
+        if draws is not None:
+            _log_draws(draws, what, control.checkpoint)
     return reconstruction
 
 
 def expected_iterations(options: SolverOptions) -> int:
     """A guess of the iterations of a run: those of the solution and those of the draws."""
-    return schedule_of(options).expected_iterations + options.ndraws * DRAW_ITERATIONS
+    return schedule_of(options).expected_iterations + (options.ndraws + options.jackknife * MOST_GROUPS) * DRAW_ITERATIONS
 
 
 def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd, record):
@@ -166,30 +169,29 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
 
 
 class _Drawing:
-    """The progress of the bootstrap, after every draw."""
+    """The progress of jackknife and bootstrap, after every draw."""
+
+    WORDS = {"draws": "bootstrap: draw", "jackknife": "jackknife: group"}
 
     def __init__(self, progress, preparing):
         self._progress, self._preparing = progress, preparing
 
-    def __call__(self, draws):
+    def __call__(self, name, draws):
         """Say how many draws are made; before the first one, too."""
         self._preparing.over = True
-        self._progress.draw(len(draws), draws.asked)
+        self._progress.draw(self.WORDS[name], len(draws), draws.asked)
 
 
-def _log_draws(reconstruction, checkpoint):
-    """Write to the log what became of the bootstrap."""
-    draws = reconstruction.draws
-    if draws is None:
-        return
+def _log_draws(draws, name, checkpoint):
+    """Write to the log what became of the bootstrap, or of the jackknife."""
     if not draws.asked:
-        log.info("no draws: the model is empty")
+        log.info(f"no {name}: the model is empty")
     elif draws.complete:
-        log.info(f"errors of the model follow from {len(draws)} draws")
+        log.info(f"errors of the model follow from {len(draws)} {name}")
     else:
         what = "errors follow from these" if len(draws) >= FEWEST else "no errors follow from so few"
         go_on = f"; restart = True makes the others, from '{checkpoint.path}'" if checkpoint and checkpoint.stands else ""
-        log.warn(f"{len(draws)} draws of {draws.asked} were made before the run was stopped: {what}{go_on}")
+        log.warn(f"{len(draws)} of {draws.asked} {name} were made before the run was stopped: {what}{go_on}")
 
 
 class _Preparing:
@@ -301,11 +303,26 @@ def _log_islands(record, significance, cell_rad):
                  f"FWHM {island['fwhm_arcsec']:.3g} arcsec")
     if faint:
         log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")
+    _compare_errors(islands)
     worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"], default=None)
     if worst and worst["snr"] > STRUCTURE:
         log.warn(f"the residual image is not consistent with noise: smoothed to {worst['beams']:g} beams it reaches "
                  f"{worst['snr']:.3g} sigma. Possible causes are calibration errors, emission outside the image, or emission "
                  "that the model cannot represent")
+
+
+def _compare_errors(islands):
+    """Say how the errors of the jackknife compare with those of the bootstrap, where there are both."""
+    ratios = [island["jackknife_error_jy"] / island["bootstrap_error_jy"] for island in islands
+              if "jackknife_error_jy" in island and island.get("bootstrap_error_jy", 0) > 0]
+    if not ratios:
+        return
+    middle = float(np.median(ratios))
+    differ = middle > DIFFER or middle < 1 / DIFFER
+    (log.warn if differ else log.info)(
+        f"errors of the fluxes of islands by the jackknife over snapshots are {middle:.2g} times those by the bootstrap (median of "
+        f"{len(ratios)})" + (": more than the noise explains, as calibration errors that differ between snapshots would be; the larger "
+                             "errors are to be believed" if middle > DIFFER else ""))
 
 
 def _shortened(angle, digits):

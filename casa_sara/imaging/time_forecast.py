@@ -11,7 +11,7 @@ import numpy as np
 from casa_sara.data.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.sky import sky_operator
-from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, DRAW_REWEIGHTINGS
+from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, DRAW_REWEIGHTINGS, MOST_GROUPS
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
 from casa_sara.reconstruction.reconstruct import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
@@ -42,7 +42,7 @@ class Timing:
     channels : int
         Of the image, each of which takes as much.
     draws : int
-        Of the bootstrap.
+        Of bootstrap and jackknife.
     """
 
     reading: float
@@ -59,7 +59,7 @@ class Timing:
 
     @property
     def drawing(self) -> float:
-        """Seconds of the bootstrap."""
+        """Seconds of the draws."""
         return self.draws * (DRAW_ITERATIONS + REWEIGHTING * DRAW_REWEIGHTINGS) * self.iteration
 
     @property
@@ -89,7 +89,7 @@ def measure(data, offsets, grid, options, reading):
     -------
     Timing
     """
-    writing = writing_seconds(data.size, grid.shape) + error_seconds(options.ndraws, grid.shape)
+    writing = writing_seconds(data.size, grid.shape) + error_seconds(options, grid.shape)
     if not options.niter:
         return Timing(reading, 0.0, 0.0, 0.0, 0.0, writing, 0, 0)
     start = time.perf_counter()
@@ -110,7 +110,7 @@ def measure(data, offsets, grid, options, reading):
     schedule = schedule_of(options)
     of_blocks = schedule.nnls_iterations if options.method == PAPER else 0
     return Timing(reading, building, pair, first, _seconds(ppd.step), writing, schedule.expected_iterations,
-                  schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks, draws=options.ndraws)
+                  schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks, draws=_draws(options))
 
 
 def _seconds(call, repeats=3):
@@ -129,8 +129,14 @@ def writing_seconds(samples, shape):
     return MARGIN * (WRITE_BASE + WRITE_SAMPLE * samples + WRITE_PIXEL * math.prod(shape))
 
 
-def error_seconds(draws, shape):
-    """Seconds that making and writing the images of errors from so many draws takes, with a margin."""
+def _draws(options):
+    """Draws of bootstrap and jackknife, which has as many groups as there can be."""
+    return options.ndraws + options.jackknife * MOST_GROUPS
+
+
+def error_seconds(options, shape):
+    """Seconds that making and writing the images of errors from draws takes, with a margin."""
+    draws = _draws(options)
     return MARGIN * (draws * SMOOTH_PIXEL + 2 * bool(draws) * WRITE_PIXEL) * math.prod(shape)
 
 

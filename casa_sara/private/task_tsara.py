@@ -79,7 +79,8 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
 
 def _prepare(parameters, selection, grid, stack):
     """Take the imagename for as long as the stack lasts, and return the options of the output."""
-    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"]))
+    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"])
+                    + parameters["jackknife"])
     stack.enter_context(one_run_of(parameters["imagename"]))
     recover_products(parameters["imagename"])
     output = _output(parameters)
@@ -171,9 +172,10 @@ def _refuse_for_cubes(parameters):
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
-    if parameters["ndraws"]:
-        raise ValueError(f"ndraws = {parameters['ndraws']} with specmode = 'cube': errors are drawn for continuum images only; "
-                         "should be 0")
+    for name, right in (("ndraws", 0), ("jackknife", False)):
+        if parameters[name]:
+            raise ValueError(f"{name} = {parameters[name]} with specmode = 'cube': errors are found for continuum images only; "
+                             f"should be {right}")
     if parameters["report"]:
         raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be False")
 
@@ -199,6 +201,7 @@ def _check_method(parameters):
     for name, right, reason in (("regscale", 1.0, "its prior has no weight that depends on the noise"),
                                 ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
                                 ("ndraws", 0, "its errors are not known from draws"),
+                                ("jackknife", False, "its errors are not known from draws"),
                                 ("parallel", False, "it runs in one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, "
@@ -265,6 +268,8 @@ def _solver_options(parameters, comm):
     if parameters["ndraws"] == 1 or parameters["ndraws"] and parameters["niter"] == 0:
         raise ValueError(f"ndraws = {parameters['ndraws']} with niter = {parameters['niter']}: an error takes two draws or more "
                          "of a model that was solved; should be 0, or at least 2 (20 are usual)")
+    if parameters["jackknife"] and parameters["niter"] == 0:
+        raise ValueError("jackknife = True with niter = 0: an error takes a model that was solved; should be False")
     if not parameters["regscale"] > 0:
         raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the automatic weight of the prior")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}

@@ -1,9 +1,9 @@
-"""The parametric bootstrap: the same sky observed again with other noise, and solved again, tells the error of a model."""
+"""Errors of a model from solving again: other noise on the same sky (bootstrap), or fewer snapshots (jackknife)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,13 @@ from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.noise_draws import draw_noise
 from casa_sara.solver.significance import SignificantSupport
 
-__all__ = ["DRAW_ITERATIONS", "DRAW_REWEIGHTINGS", "Bootstrap"]
+__all__ = ["DRAW_ITERATIONS", "DRAW_REWEIGHTINGS", "Bootstrap", "Jackknife", "jackknife_groups"]
 
 STAGES, INTERVAL = 3, 30  # problems of a draw, and iterations of each
 DRAW_ITERATIONS, DRAW_REWEIGHTINGS = STAGES * INTERVAL, STAGES - 1
 SEED = 20181
+MOST_GROUPS, FEWEST_GROUPS = 10, 4  # of snapshots
+BLIND = 1e5  # times the noise of data that count no more
 
 
 @dataclass
@@ -82,10 +84,15 @@ class Bootstrap:
                     return
             difference = self.ppd.scratch_image
             np.subtract(self.ppd.model, self.model, out=difference)
-            difference *= difference.dtype.type(self.ppd.unit_jy)
+            difference *= difference.dtype.type(self.ppd.unit_jy * self._factor)
             self.draws.add(difference)
             self.done = 0
             progress(self.draws)
+
+    @property
+    def _factor(self):
+        """On the difference of a draw, whose mean square then is the variance."""
+        return 1.0
 
     def _observe(self):
         """Replace the data by those of the present draw, which depend on its number alone."""
@@ -93,8 +100,14 @@ class Bootstrap:
         ppd.measurement.forward(self.model, ppd.vis)
         draw_noise(ppd, np.random.default_rng([SEED, len(self.draws)]), self.bounds.noise, noise)
         ppd.vis += noise
+        self._begin()
+
+    def _begin(self):
+        """Take κ of the solution, and the bounds."""
         if not self.done:
-            ppd.rescale(self.threshold)
+            self.ppd.rescale(self.threshold)
+            self.bounds.apply_to(self.ppd)
+            self.bounds.finish(self.ppd)
 
     def _renew_weights(self):
         """Find support and weights anew; the bounds then are what they were in the last problem of the solution."""
@@ -107,3 +120,40 @@ class Bootstrap:
     def state(self) -> dict[str, Any]:
         """Return what :meth:`run` goes on from, beside the states of the iteration and of the bounds."""
         return dict(scale=self.scale, model=self.model, threshold=self.threshold, draws=self.draws.arrays(), done=self.done)
+
+
+@dataclass
+class Jackknife(Bootstrap):
+    """Solutions without one group of blocks each: Var x̂ = (g − 1)/g Σ (x_k − x̂)² over the g groups.
+
+    Calibration errors that differ from snapshot to snapshot count in full, and so does what the coverage of a group tells of
+    the sky. The noise of the blocks left out is taken to be 10⁵ times what was found. Parameters are those of `Bootstrap`;
+    `draws` has as many as there are groups. It is run before the bootstrap, which replaces the data.
+    """
+
+    @property
+    def _factor(self):
+        return (self.draws.asked - 1) ** 0.5
+
+    def __post_init__(self):
+        self._of_all = self.bounds
+
+    def _observe(self):
+        l2_bounds = self._of_all.l2_bounds
+        left_out = np.arange(len(l2_bounds)) % self.draws.asked == len(self.draws)
+        self.bounds = replace(self._of_all, l2_bounds=np.where(left_out, BLIND, 1.0) * l2_bounds)
+        self._begin()
+
+
+def jackknife_groups(blocks: int) -> int:
+    """Return into how many groups a jackknife divides so many blocks.
+
+    Raises
+    ------
+    ValueError
+        They are too few.
+    """
+    if blocks < FEWEST_GROUPS:
+        raise ValueError(f"jackknife = True: there are {blocks} blocks of data; a jackknife over snapshots needs {FEWEST_GROUPS} "
+                         "or more. blocks can divide the data further")
+    return min(blocks, MOST_GROUPS)

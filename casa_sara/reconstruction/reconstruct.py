@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
-from casa_sara.reconstruction.bootstrap import Bootstrap
+from casa_sara.reconstruction.bootstrap import Bootstrap, Jackknife, jackknife_groups
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.draws import FEWEST, Draws
 from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
@@ -35,6 +35,7 @@ __all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "r
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
+ERRORS_OF_ISLANDS = dict(draws="bootstrap_error_jy", jackknife="jackknife_error_jy")
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 
 
@@ -53,7 +54,8 @@ class Control:
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
         whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
     drawn : callable
-        Called with the `Draws` before the first draw of the bootstrap, and after each.
+        Called with 'jackknife' and its `Draws`, then with 'draws' and those of the bootstrap: before the first one of each,
+        and after every one.
     then : callable, optional
         Called at the end with the iteration, its bounds and its record, all as the solution has left them.
     """
@@ -61,7 +63,7 @@ class Control:
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
     stopped: Callable[[], bool] = lambda: False
     checkpoint: Checkpoint | None = None
-    drawn: Callable[[Draws], None] = lambda draws: None
+    drawn: Callable[[str, Draws], None] = lambda name, draws: None
     then: Callable[[AdaptivePPD, Any, SolverRecord], None] | None = None
 
 
@@ -88,8 +90,8 @@ class Reconstruction:
         Samples that were used, numbers into the data given.
     wild : list of dict
         The others, named: see :class:`casa_sara.data.outliers.WildSamples`.
-    draws : Draws or None
-        Of the bootstrap, where it was asked for and the solution has come to an end.
+    draws, jackknife : Draws or None
+        Of the bootstrap and of the jackknife, where asked for and the solution has come to an end.
     """
 
     model: np.ndarray
@@ -103,6 +105,7 @@ class Reconstruction:
     kept: np.ndarray
     wild: list[dict]
     draws: Draws | None = None
+    jackknife: Draws | None = None
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Reconstruction:
@@ -115,7 +118,8 @@ class Reconstruction:
     @property
     def finished(self) -> bool:
         """Whether a restart would have nothing to continue."""
-        return self.record.stop_code not in UNFINISHED and (self.draws is None or self.draws.complete)
+        drawn = [draws for draws in (self.jackknife, self.draws) if draws is not None]
+        return self.record.stop_code not in UNFINISHED and all(draws.complete for draws in drawn)
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -150,6 +154,8 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     """
     comm, checkpoint = ranks.comm, control.checkpoint
     check_l2bound(options, len(samples.offsets) - 1)
+    if options.jackknife:
+        jackknife_groups(len(samples.offsets) - 1)
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(comm.mean(samples.data.weight, dtype=float) ** -0.5)
     problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support, comm=comm,
@@ -169,8 +175,9 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         solution.result = _result(solution, record, samples, comm, control.then is not None)
         if control.then:
             control.then(solution.ppd, solution.bounds, record)
-    if solution.bootstrap is not None:
-        _draw(solution, control, layout, ranks)
+    for name, resampling in solution.resamplings.items():
+        if not _draw(solution, name, resampling, control, layout, ranks):
+            break
     return solution.result
 
 
@@ -198,11 +205,15 @@ def _iterate(solution, options, control, layout, ranks):
 
 def _begin_draws(solution, record, options):
     """Make ready for the draws, once the solution has come to an end; an empty model has no errors to draw."""
-    ppd = solution.ppd
-    if options.ndraws and record.stop_code not in (*UNFINISHED, DIVERGED):
-        draws = Draws(ppd.model.shape, options.ndraws if ppd.model.any() else 0)
-        scale = record.reweightings[-1]["scale"] if record.reweightings else 0.0
-        solution.bootstrap = Bootstrap(ppd, solution.bounds, _support(options), scale, ppd.model.copy(), ppd.threshold, draws)
+    ppd, blocks = solution.ppd, len(solution.bounds.l2_bounds)
+    if record.stop_code in (*UNFINISHED, DIVERGED):
+        return
+    scale = record.reweightings[-1]["scale"] if record.reweightings else 0.0
+    for name, kind, asked in (("jackknife", Jackknife, jackknife_groups(blocks) if options.jackknife else 0),
+                              ("draws", Bootstrap, options.ndraws)):
+        if asked:
+            draws = Draws(ppd.model.shape, asked if ppd.model.any() else 0)
+            solution.resamplings[name] = kind(ppd, solution.bounds, _support(options), scale, ppd.model.copy(), ppd.threshold, draws)
 
 
 def _support(options):
@@ -210,14 +221,15 @@ def _support(options):
     return SignificantSupport(options.significance, begun=True) if schedule_of(options).confined else None
 
 
-def _draw(solution, control, layout, ranks):
-    """Make the draws of the bootstrap, keeping the state now and then; add the errors of the islands to the record."""
-    keep = partial(_keep, solution, control.checkpoint, layout, ranks, None)
-    draws = solution.bootstrap.draws
-    control.drawn(draws)
-    solution.bootstrap.run(control.stopped, control.drawn, keep)
+def _draw(solution, name, resampling, control, layout, ranks):
+    """Make the draws of one kind, keeping the state now and then, and add the errors of islands; return whether all are made."""
+    draws = resampling.draws
+    drawn = partial(control.drawn, name)
+    drawn(draws)
+    resampling.run(control.stopped, drawn, partial(_keep, solution, control.checkpoint, layout, ranks, None))
     if len(draws) >= FEWEST:
-        add_flux_errors(solution.result.record.islands, solution.bootstrap.model, draws.flux_errors)
+        add_flux_errors(solution.result.record.islands, resampling.model, draws.flux_errors, ERRORS_OF_ISLANDS[name])
+    return draws.complete
 
 
 def _keep(solution, checkpoint, layout, ranks, stage, now):
@@ -235,8 +247,8 @@ def _keep(solution, checkpoint, layout, ranks, stage, now):
 def _result(solution, record, samples, comm, goes_on):
     """Return what was found, in Jy; the iteration keeps its model where it `goes_on`."""
     found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
-    bootstrap = solution.bootstrap
-    model = ppd.model.copy() if bootstrap or goes_on else comm.own(ppd.model)
+    resamplings = solution.resamplings
+    model = ppd.model.copy() if resamplings or goes_on else comm.own(ppd.model)
     if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
@@ -244,7 +256,7 @@ def _result(solution, record, samples, comm, goes_on):
         model, bounds.l2_bounds, ppd.residual_norms.copy(), found.nnls_norms, record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
-        wild=found.wild, draws=bootstrap and bootstrap.draws)
+        wild=found.wild, **{name: resampling.draws for name, resampling in resamplings.items()})
 
 
 @dataclass
@@ -256,7 +268,7 @@ class _Solution:
     bounds: AdaptiveBounds | GivenBounds | PaperBounds
     stage: Stage | PaperStage | None = None
     result: Reconstruction | None = None
-    bootstrap: Bootstrap | None = None
+    resamplings: dict[str, Bootstrap] = field(default_factory=dict)
 
     @classmethod
     def of(cls, problem, found, options, ranks):
@@ -283,10 +295,10 @@ class _Solution:
         ppd |= {name: kept.gather(ppd[name]) for name in SAMPLE_ARRAYS}
         ppd |= {name: ranks.gather_bases(ppd[name]) for name in BASIS_ARRAYS}
         state = dict(found=found, ppd=ppd, bounds=self.bounds.state())
-        if self.bootstrap is None:
+        if self.result is None:
             return state | dict(stage=stage.state())
-        result = vars(self.result) | dict(record=self.result.record.state(), kept=None, draws=None)
-        return state | dict(result=result, bootstrap=self.bootstrap.state())
+        result = vars(self.result) | dict(record=self.result.record.state(), kept=None, draws=None, jackknife=None)
+        return state | dict(result=result, resamplings={name: one.state() for name, one in self.resamplings.items()})
 
 
 def _begin(samples, problem_of, options, startmodel, stopped, ranks):
@@ -325,20 +337,23 @@ def _resume(samples, layout, problem_of, options, checkpoint, ranks):
         ppd |= {name: ranks.scatter_bases(ppd[name]) for name in BASIS_ARRAYS}
         solution.ppd.set_state(ppd)
         solution.bounds.set_state(state["bounds"])
-        if "bootstrap" in state:
+        if "resamplings" in state:
             kept = np.delete(samples.kept, found.left_out)
-            _resume_draws(solution, options, state["result"] | dict(kept=kept), state["bootstrap"])
+            _resume_draws(solution, options, state["result"] | dict(kept=kept), state["resamplings"])
         else:
             solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
     return solution
 
 
-def _resume_draws(solution, options, result, state):
+def _resume_draws(solution, options, result, states):
     """Take over the result, and the draws so far."""
     solution.result = Reconstruction.of(result)
-    solution.result.draws = draws = Draws.of(state["draws"])
-    solution.bootstrap = Bootstrap(solution.ppd, solution.bounds, _support(options), state["scale"], np.array(state["model"]),
-                                   state["threshold"], draws, state["done"])
+    for name, state in states.items():
+        draws = Draws.of(state["draws"])
+        setattr(solution.result, name, draws)
+        solution.resamplings[name] = (Jackknife if name == "jackknife" else Bootstrap)(
+            solution.ppd, solution.bounds, _support(options), state["scale"], np.array(state["model"]), state["threshold"], draws,
+            state["done"])
 
 
 def check_l2bound(options: SolverOptions, blocks: int) -> None:

@@ -92,8 +92,9 @@ def _labelled(model):
     return label(model != 0, np.ones((3, 3), int))
 
 
-def add_flux_errors(islands: list[dict[str, Any]], model: np.ndarray, flux_errors: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Give the islands of a model the errors of their fluxes that a bootstrap finds, `bootstrap_error_jy`.
+def add_flux_errors(islands: list[dict[str, Any]], model: np.ndarray, flux_errors: Callable[[np.ndarray], np.ndarray],
+                    name: str) -> None:
+    """Give the islands of a model the errors of their fluxes that draws find.
 
     The flux of a draw belongs to the nearest island, wherever in its surroundings the draw has it.
 
@@ -105,6 +106,8 @@ def add_flux_errors(islands: list[dict[str, Any]], model: np.ndarray, flux_error
         x̂.
     flux_errors : callable
         Takes the number of the region of each pixel, int (nx, ny), and returns the error of each region's flux in Jy.
+    name : str
+        Of the entry.
     """
     if not islands:
         return
@@ -112,7 +115,7 @@ def add_flux_errors(islands: list[dict[str, Any]], model: np.ndarray, flux_error
     nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
     errors = flux_errors(labels[tuple(nearest)])
     for island in islands:
-        island["bootstrap_error_jy"] = float(errors[labels[island["x_peak"], island["y_peak"]] - 1])
+        island[name] = float(errors[labels[island["x_peak"], island["y_peak"]] - 1])
 
 
 def _response(part, psf):

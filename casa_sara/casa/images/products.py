@@ -1,5 +1,5 @@
 """What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
-(.mask .image.pbcor .model.pbcor .model.error .image.error .draws.npz), and the record .sara.json.
+(.mask .image.pbcor .model.pbcor .model.error .image.error .image.jackknife .draws.npz), and the record .sara.json.
 
 They appear together (:mod:`casa_sara.runtime.atomic`), and replace those of an older run of this name together.
 """
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor", ".model.error", ".image.error")
+ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor", ".model.error", ".image.error", ".image.jackknife")
 DRAWS = ".draws.npz"  # of a bootstrap
 CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
@@ -107,8 +107,8 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None, 
     plane : ImagePlane
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
-        residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'model.error' and 'image.error'
-        where there are.
+        residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'model.error', 'image.error' and
+        'image.jackknife' where there are.
     sumwt : float, or one for each channel
     beam : dict
         Of `restore.fit_beam`, or a list with one for each channel.
@@ -155,9 +155,9 @@ def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor
         write_corrected(root, plane, images["model"])
     if "model.error" in images:
         write_image(root + ".model.error", images["model.error"], plane, unit="Jy/pixel")
-    if "image.error" in images:
-        write_image(root + ".image.error", images["image.error"], plane, unit="Jy/beam",
-                    beam=restored_beam(list(restoringbeam), beam), masked=plane.masks_all)
+    for name in {"image.error", "image.jackknife"} & images.keys():
+        write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored_beam(list(restoringbeam), beam),
+                    masked=plane.masks_all)
     for path in existing_products(root):
         with opened("image", path) as ia:
             ia.sethistory(origin="tsara", history=list(history))

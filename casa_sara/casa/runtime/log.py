@@ -103,7 +103,7 @@ class Progress:
         self._live = self._stream.isatty() and not _silent
         self._start = time.monotonic()
         self._first = None  # time and fraction at the end of the first iteration
-        self._first_draw = None  # time and number of the draws before the first
+        self._first_draws = {}  # time and number of the draws of each name before the first
 
     def __call__(self, iteration, message, fraction=None):
         """Report the state after iteration number `iteration` (from 1).
@@ -126,12 +126,12 @@ class Progress:
             info(line)
         self._draw(line, fraction)
 
-    def draw(self, number, asked):
-        """Report that so many draws of the bootstrap are made, 0 before the first; the time left follows from those made since."""
+    def draw(self, name, number, asked):
+        """Report that so many draws of this name are made, 0 before the first; the time left follows from those made since."""
         now = time.monotonic()
-        begin, before = self._first_draw = self._first_draw or (now, number)
+        begin, before = self._first_draws.setdefault(name, (now, number))
         left = f", about {_spell((now - begin) * (asked - number) / (number - before))} left" if number > before else ""
-        line = f"bootstrap: draw {number} of {asked}; {_spell(now - self._start)} elapsed{left}"
+        line = f"{name} {number} of {asked}; {_spell(now - self._start)} elapsed{left}"
         info(line)
         self._draw(line, number / max(asked, 1))
 
