@@ -149,10 +149,10 @@ def test_islands_have_the_errors_of_their_surroundings():
 
 # within a reconstruction
 
-WITH_DRAWS = {"options": SolverOptions(**vars(OPTIONS) | dict(ndraws=3, significance=5.0))}
+WITH_DRAWS = SolverOptions(**vars(OPTIONS) | dict(ndraws=3))
 
 
-def image(sky, path="", stop_in=None, options=WITH_DRAWS["options"]):
+def image(sky, path="", stop_in=None, options=WITH_DRAWS, noise=(1.0, np.nan)):
     """Reconstruct, and stop after so many iterations of draws."""
     data, offsets = sky
     checkpoint = None
@@ -167,7 +167,7 @@ def image(sky, path="", stop_in=None, options=WITH_DRAWS["options"]):
             drawing[0] += 1
         return bool(drawing) and drawing[0] == stop_in
 
-    samples = Samples(data, offsets, np.ones(data.size), np.array([1.0, np.nan]))
+    samples = Samples(data, offsets, np.ones(data.size), np.array(noise))
     return reconstruct(samples, GRID, options, control=Control(
         stopped=stopped, checkpoint=checkpoint, drawn=lambda name, draws: drawing or drawing.append(0)))
 
@@ -178,7 +178,7 @@ def whole(sky):  # noqa: F811
 
 
 def test_draws_leave_the_image_as_it_is(sky, whole):  # noqa: F811
-    plain = image(sky, options=SolverOptions(**vars(WITH_DRAWS["options"]) | dict(ndraws=0)))
+    plain = image(sky, options=SolverOptions(**vars(WITH_DRAWS) | dict(ndraws=0)))
     assert plain.draws is None and plain.finished and whole.finished and whole.record.stop_code == CONVERGED
     np.testing.assert_array_equal(whole.model, plain.model)
     np.testing.assert_array_equal(whole.residual_norms, plain.residual_norms)
@@ -200,3 +200,27 @@ def test_draws_go_on_as_if_never_stopped(sky, whole, tmp_path, moments):  # noqa
     for name, array in whole.draws.arrays().items():
         np.testing.assert_array_equal(found.draws.arrays()[name], array)
     np.testing.assert_array_equal(found.kept, whole.kept)
+
+
+def test_a_jackknife_and_the_draws_after_it_go_on_as_if_never_stopped(sky, tmp_path):  # noqa: F811
+    data, offsets = sky
+    quarters = data, np.sort(np.concatenate([offsets, (offsets[:-1] + offsets[1:]) // 2]))
+    options = SolverOptions(**vars(OPTIONS) | dict(ndraws=2, jackknife=True))
+
+    def solved(path="", stop_in=None):
+        return image(quarters, path, stop_in, options, noise=np.full(4, np.nan))
+
+    wanted, path = solved(), tmp_path / "c"
+    assert len(wanted.jackknife) == 4 and len(wanted.draws) == 2 and wanted.finished
+    plain = image(quarters, options=SolverOptions(**vars(OPTIONS) | dict(ndraws=2)), noise=np.full(4, np.nan))
+    np.testing.assert_array_equal(plain.model, wanted.model)
+    for moment in (50, DRAW_ITERATIONS + 10, 2 * DRAW_ITERATIONS - 60 + 45):  # groups 0 and 1, then the first draw
+        stopped = solved(path, moment)
+        assert not stopped.finished and stopped.draws is not None
+    assert len(stopped.jackknife) >= 3
+    found = solved(path)
+    for name in ("jackknife", "draws"):
+        for key, array in getattr(wanted, name).arrays().items():
+            np.testing.assert_array_equal(getattr(found, name).arrays()[key], array)
+    assert [(island["bootstrap_error_jy"], island["jackknife_error_jy"]) for island in found.record.islands] \
+        == [(island["bootstrap_error_jy"], island["jackknife_error_jy"]) for island in wanted.record.islands]
