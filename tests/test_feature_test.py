@@ -113,13 +113,17 @@ def test_a_source_is_real_where_it_is_and_not_beside():
     """S/N 8 at (30.3, 30); the bright source beside is 500 times as strong."""
     noise = NOISE_JY / np.sqrt(4800)
     sources = [(4000 * noise, 12, 20), (8 * noise, 30.3, 30)]
-    result, (real, nothing, bright) = image_and_test(sources, 1, [(30, 30), (12, 38), (12, 20)])
+    result, (real, nothing, bright, again) = image_and_test(sources, 1, [(30, 30), (12, 38), (12, 20), (30, 30)])
     assert 30 < real.change < 110 and real.sigma > 4 and real.rank_p_value == 1 / 11
     assert real.flux_jy == pytest.approx(8 * noise, abs=4 * noise)
     assert nothing.change < 25 and nothing.p_value > 0.02
     assert bright.sigma > 20
     x, y = np.indices(GRID.shape)
     assert not real.without[np.hypot(x - 30, y - 30) <= 3].any() and real.with_[30, 30] + real.with_[31, 30] > 0
+    # each test begins from the solution
+    assert again.change == pytest.approx(real.change, abs=8)
+    point = [one.with_[np.hypot(x - 30, y - 30) <= 4] for one in (real, nothing)]
+    assert point[0].min() == 0 > point[1].min()  # a point between pixels, where its region is not the one tested
     plain = reconstruct(Samples(*data_with(sources, 1), np.ones(4800), np.ones(2)), GRID, OPTIONS)
     np.testing.assert_array_equal(result.model, plain.model)
 
