@@ -1,17 +1,21 @@
 """The study of errors: how often the true sky lies within 1 and 2 of the errors that tsara's ndraws gives.
 
-    python benchmarks/error_coverage.py FOLDER                       # the faint skies of faint_scenes.py, those of 'chosen'
-    python benchmarks/error_coverage.py FOLDER --set apart           # those that were looked at once
-    python benchmarks/error_coverage.py FOLDER --set bright          # every sky of quality.py, and gain errors of 1 %
-    python benchmarks/error_coverage.py FOLDER --only table          # the tables of what was run before
-    python benchmarks/error_coverage.py FOLDER --scenes arcs_30      # only scenes whose name holds this
+    python benchmarks/error_coverage.py FOLDER                  # the faint skies of faint_scenes.py, those of 'chosen'
+    python benchmarks/error_coverage.py FOLDER --set apart      # those that were looked at once
+    python benchmarks/error_coverage.py FOLDER --set bright     # every sky of quality.py, and gain errors of 1 %
+    python benchmarks/error_coverage.py FOLDER --only table     # the tables of what was run before
+    python benchmarks/error_coverage.py FOLDER --scenes arcs_30 # only scenes whose name holds this
     python benchmarks/error_coverage.py FOLDER --ndraws 50
+    python benchmarks/error_coverage.py FOLDER --nothing 6      # p-values of so many places of every sky where nothing is
 
-All skies are drawn on pixels three times finer than the image's. The model and the truth are smoothed to the restoring beam
-(natural weights; bright skies: Briggs −1), and their difference is divided by the error of that, for all pixels where the
-smoothed model is more than 5 times its error; there are several of them in a beam, so that fractions have the scatter of
-beams, not of pixels. Fluxes are those of islands of S/N 5 and more, each with the surroundings of one beam. Without errors
-from draws the record has the error of an island of known shape, the last column. All run on one thread.
+All skies are drawn on pixels three times finer than the image's. The model and the truth are smoothed to the restoring
+beam (natural weights; bright skies: Briggs −1), and their difference is divided by the error of that, for all pixels
+where the smoothed model is more than 5 times its error; there are several of them in a beam, so that fractions have the
+scatter of beams, not of pixels. Fluxes are those of islands of S/N 5 and more, each with the surroundings of one beam.
+"The error of a known shape" is what the record has without draws. All run on one thread.
+
+With --nothing, circles of one beam's radius, two beams away from where the smoothed truth is above a thousandth of its
+peak, are tested as saracompare's features are, on the images that an earlier run has left; the p-values should be uniform.
 """
 
 from __future__ import annotations
@@ -35,6 +39,7 @@ from scenes import SCENES, smoothed_truth
 
 SIGNIFICANT = 5.0
 RATIOS = (5, 10, 30, 100, np.inf)  # S/N at one beam, of the rows of a table
+APART = 3.0  # beams of the centre of a place where nothing is, from all that is and from other places
 GAIN_ERRORS = ("cyga", "M31", "3c353")
 
 
@@ -97,9 +102,9 @@ class Deviations:
     ratio: np.ndarray
 
     def row(self, low: float, high: float) -> list[float]:
-        """How many there are between two S/N, the fractions within 1 and 2, and the median |z| over that of a Gaussian."""
+        """How many there are between two S/N, the parts within 1 and 2, and the median |z| over that of a Gaussian."""
         z = np.abs(self.z[(self.ratio >= low) & (self.ratio < high)])
-        return [z.size, (z < 1).mean(), (z < 2).mean(), np.median(z) / 0.6745] if z.size else [0, np.nan, np.nan, np.nan]
+        return [z.size, (z < 1).mean(), (z < 2).mean(), np.median(z) / 0.6745] if z.size else [0, *3 * [np.nan]]
 
 
 def at_one_beam(sky, model, draws, beam) -> Deviations:
@@ -116,7 +121,7 @@ def at_one_beam(sky, model, draws, beam) -> Deviations:
 
 
 def of_islands(sky, model, islands, draws, beam) -> tuple[Deviations, np.ndarray]:
-    """Compare the fluxes of islands with the truth; return also the differences in units of the error for a known shape."""
+    """Compare the fluxes of islands with the truth; return also the differences over the errors for a known shape."""
     from scipy.ndimage import distance_transform_edt, label
 
     labels, number = label(model != 0, np.ones((3, 3), int))
@@ -153,17 +158,60 @@ def run(sky, folder: Path, ndraws: int) -> None:
     if os.path.exists(f"{root}.draws.npz"):
         draws = read_draws(f"{root}.draws.npz")
         kept["bytes_per_pixel"] = os.path.getsize(f"{root}.draws.npz") / model.size
-        beams, (islands, known) = at_one_beam(sky, model, draws, beam), of_islands(sky, model, made["sara"]["islands"], draws, beam)
+        beams = at_one_beam(sky, model, draws, beam)
+        islands, known = of_islands(sky, model, made["sara"]["islands"], draws, beam)
         kept |= dict(z=beams.z, ratio=beams.ratio, island_z=islands.z, island_ratio=islands.ratio, island_known=known)
     np.savez_compressed(folder / "coverage.npz", **kept)
 
 
+def p_values(sky, folder: Path, number: int, seed: int = 1) -> list[tuple[float, float]]:
+    """Return p-value and rank p-value of places of an imaged sky where nothing is."""
+    from casa_sara.casa.images.image_sets import read_image_set
+    from casa_sara.comparison.features import test_features
+    from casa_sara.demo.imagers import quiet
+    from casa_sara.options import Selection
+    from scipy.ndimage import distance_transform_edt
+
+    parameters = sky.prepare(folder)
+    one = read_image_set(parameters["imagename"])
+    beam = [axis / float(parameters["cell"].removesuffix("arcsec")) for axis in one.beam[:2]] + [one.beam[2]]
+    radius, truth = float(np.sqrt(beam[0] * beam[1])), sky.smoothed(beam)
+    x, y = np.indices(truth.shape)
+    free = distance_transform_edt(truth < 1e-3 * truth.max()) > APART * radius
+    regions, rng = {}, np.random.default_rng(seed)
+    edge = int(2 * radius)
+    for _ in range(1000):
+        px, py = (int(rng.integers(edge, n - edge)) for n in truth.shape)
+        region = np.hypot(x - px, y - py) <= radius
+        if len(regions) < number and free[region].all():
+            regions[f"{px}, {py}"] = region
+            free[np.hypot(x - px, y - py) <= APART * radius] = False
+    vis = parameters["vis"] if isinstance(parameters["vis"], list) else [parameters["vis"]]
+    with quiet(folder / "nothing.txt"):
+        found = test_features(one, regions, Selection(tuple(vis), datacolumn="data"))
+    return [(result.p_value, result.rank_p_value) for result in found.values()]
+
+
+def print_p_values(chosen: list, base: Path, number: int) -> None:
+    """Test, and print how many of the p-values are below some."""
+    values = []
+    for sky in chosen:
+        if (base / sky.name / "tsara.model").exists():
+            found = p_values(sky, base / sky.name, number)
+            values += found
+            print(f"{sky.name}: " + ", ".join(f"{p:.3g} ({rank:.2g})" for p, rank in found), flush=True)
+    values = np.array(values).reshape(-1, 2)
+    below = ", ".join(f"{(values[:, 0] < p).mean():.3f} of them below {p}" for p in (0.01, 0.05, 0.1, 0.25, 0.5, 0.75))
+    print(f"\n{len(values)} p-values where nothing is: {below}.")
+
+
 def print_table(group: str, chosen: list, base: Path) -> None:
     """Print what was found, by sky and by S/N."""
-    found = {sky.name: np.load(base / sky.name / "coverage.npz") for sky in chosen if (base / sky.name / "coverage.npz").exists()}
+    paths = {sky.name: base / sky.name / "coverage.npz" for sky in chosen}
+    found = {name: np.load(path) for name, path in paths.items() if path.exists()}
     print(f"\n## {group}: {len(found)} skies of {len(chosen)}\n")
-    print("| sky | pixels | within 1, 2 σ | median z | islands | within 1, 2 σ | with the error of a known shape | draws' time / "
-          "run's | bytes a pixel |\n" + "|---" * 9 + "|")
+    print("| sky | pixels | within 1, 2 σ | median z | islands | within 1, 2 σ | with the error of a known shape | "
+          "draws' time / run's | bytes a pixel |\n" + "|---" * 9 + "|")
     for name, one in found.items():
         ratio = f"{one['seconds'][1] / one['seconds'][0] - 1:.1f}"
         if "z" not in one:
@@ -172,13 +220,13 @@ def print_table(group: str, chosen: list, base: Path) -> None:
         beams, islands = Deviations(one["z"], one["ratio"]), Deviations(one["island_z"], one["island_ratio"])
         (pixels, *within), (count, *fluxes) = beams.row(0, np.inf), islands.row(0, np.inf)
         known = Deviations(one["island_known"], one["island_ratio"]).row(0, np.inf)
-        print(f"| {name} | {pixels} | {within[0]:.2f}, {within[1]:.2f} | {within[2]:.2f} | {count} | {fluxes[0]:.2f}, {fluxes[1]:.2f} | "
-              f"{known[1]:.2f}, {known[2]:.2f} | {ratio} | {one['bytes_per_pixel']:.1f} |")
+        print(f"| {name} | {pixels} | {within[0]:.2f}, {within[1]:.2f} | {within[2]:.2f} | {count} | {fluxes[0]:.2f}, "
+              f"{fluxes[1]:.2f} | {known[1]:.2f}, {known[2]:.2f} | {ratio} | {one['bytes_per_pixel']:.1f} |")
     for title, z, ratio in (("At one beam", "z", "ratio"), ("Islands", "island_z", "island_ratio")):
         skies = [one for one in found.values() if "z" in one]
         rows = [Deviations(one[z], one[ratio]) for one in skies]
-        print(f"\n{title}, by S/N; of pixels each sky counts as one, islands are counted one by one:\n\n| S/N | number | "
-              "within 1 σ | within 2 σ |\n" + "|---" * 4 + "|")
+        print(f"\n{title}, by S/N; of pixels each sky counts as one, islands are counted one by one:\n\n"
+              "| S/N | number | within 1 σ | within 2 σ |\n" + "|---" * 4 + "|")
         for low, high in zip(RATIOS[:-1], RATIOS[1:]):
             if z == "z":
                 lines = np.array([line for row in rows if (line := row.row(low, high))[0] >= 100]).reshape(-1, 4)
@@ -196,10 +244,14 @@ def main():
     parser.add_argument("--only", choices=("run", "table"))
     parser.add_argument("--scenes", default="", help="only skies whose name holds this")
     parser.add_argument("--ndraws", type=int, default=20)
+    parser.add_argument("--nothing", type=int, default=0, help="places of every sky to test where nothing is")
     given = parser.parse_args()
     sys.argv = sys.argv[:1]  # CASA reads the command line, too
     base = given.folder.resolve()
     chosen = [sky for sky in skies(given.set) if given.scenes in sky.name]
+    if given.nothing:
+        print_p_values(chosen, base, given.nothing)
+        return
     for sky in chosen if given.only != "table" else ():
         (base / sky.name).mkdir(parents=True, exist_ok=True)
         run(sky, base / sky.name, given.ndraws)

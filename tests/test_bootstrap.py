@@ -21,7 +21,7 @@ UNIT_JY = 3.0
 
 
 def drawn_from_dense_problem(ndraws, kind=Bootstrap, samples=(60, 80), noise=(0.05, 0.15)):
-    """Draw a least-squares image, without positivity and without prior; return the problem, 1/σ² of its samples and the draws."""
+    """Draw a least-squares image, without positivity and prior; return the problem, 1/σ² of its samples and draws."""
     problem = Problem(seed=3, samples=samples, noise=noise)
     ppd = AdaptivePPD(problem.measurement, problem.dictionary, problem.vis, problem.offsets, problem.precond,
                       problem.data_norm_sq(problem.precond), positivity=False)
@@ -73,7 +73,7 @@ def test_every_draw_is_the_solution_of_its_data():
 
 def test_every_solution_of_a_jackknife_lacks_its_blocks():
     """√(g − 1)(x_k − x̂), with x_k and x̂ of least squares; six blocks in four groups."""
-    problem, noise_weights, draws = drawn_from_dense_problem(4, Jackknife, (30, 40, 50, 60, 70, 80), (0.05, 0.1, 0.05, 0.1, 0.05, 0.1))
+    problem, noise_weights, draws = drawn_from_dense_problem(4, Jackknife, (30, 40, 50, 60, 70, 80), 3 * (0.05, 0.1))
     matrix, block = problem.measurement.matrix, np.repeat(np.arange(6), problem.samples)
 
     def least_squares(used):
@@ -152,7 +152,7 @@ def test_islands_have_the_errors_of_their_surroundings():
 WITH_DRAWS = SolverOptions(**vars(OPTIONS) | dict(ndraws=3))
 
 
-def image(sky, path="", stop_in=None, options=WITH_DRAWS, noise=(1.0, np.nan)):
+def image(sky, path="", stop_in=None, options=WITH_DRAWS, noise=(1.0, np.nan)):  # noqa: F811
     """Reconstruct, and stop after so many iterations of draws."""
     data, offsets = sky
     checkpoint = None

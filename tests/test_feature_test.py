@@ -1,4 +1,4 @@
-"""The test whether emission in a region is real: T in closed form, sources that are there, and p-values where nothing is."""
+"""The test whether emission in a region is real: T in closed form, a real source, p-values where nothing is."""
 
 import numpy as np
 import pytest
@@ -63,17 +63,21 @@ def test_probabilities_are_those_of_the_scaled_chi_square_of_the_draws():
     drawn = np.array([1.0, 3.0, 2.0, 5.0])
     empty = np.zeros((2, 2), np.float32)
     mean, variance = drawn.mean(), drawn.var(ddof=1)
-    for change in (-1.0, 2.5, 40.0):
+    for change in (-1.0, 2.5, 9.0):
         found = FeatureResult(change, drawn, 0.0, empty, empty)
         expected = chi2.sf(max(change, 0) * 2 * mean / variance, 2 * mean**2 / variance)
+        expected = max(expected, norm.sf(np.sqrt(max(change, 0))))
         assert found.p_value == pytest.approx(expected, rel=1e-9)
         if change > 0:
             assert found.sigma == pytest.approx(norm.isf(expected), rel=1e-9)
-    shifted = FeatureResult(2.5 - 4, drawn - 4, 0.0, empty, empty)  # begins at −3
-    least = -3.0
-    assert shifted.p_value == pytest.approx(chi2.sf((-1.5 - least) * 2 * (mean - 1) / variance, 2 * (mean - 1) ** 2 / variance))
+    shifted = FeatureResult(2.5 - 2, drawn - 2, 0.0, empty, empty)  # begins at −1
+    least = -1.0
+    expected = chi2.sf((0.5 - least) * 2 * (mean - 1) / variance, 2 * (mean - 1) ** 2 / variance)
+    assert shifted.p_value == pytest.approx(expected)
     assert FeatureResult(2.5, drawn, 0.0, empty, empty).rank_p_value == 3 / 5
     assert FeatureResult(1.0, np.zeros(4), 0.0, empty, empty).p_value == 1 / 5
+    for change in (4.0, 100.0):  # draws of nearly nothing make no detection of what is 2 or 10 standard deviations
+        assert FeatureResult(change, drawn / 100, 0.0, empty, empty).sigma == pytest.approx(np.sqrt(change))
     assert 30 < FeatureResult(1e5, drawn, 0.0, empty, empty).sigma < 40
 
 

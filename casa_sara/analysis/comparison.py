@@ -72,9 +72,10 @@ class Comparison:
         Plain numbers, strings, lists and dicts only:
         `products` → name → {flux_jy, peak_jy_per_pixel, negative_jy, mdr, fwhm_recovered_arcsec, injected → {source →
         {injected_jy, flux_jy, offset_arcsec, fwhm_arcsec, fwhm_in_beams → {weighting → ratio}}}, regions → {name →
-        {flux_jy, error_jy, model_flux_jy, model_error_jy}}, features → {name → {flux_jy, delta_chi_square, drawn, p_value,
-        rank_p_value, sigma}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness, chi_square →
-        [of each block]}, truth → {snr, log_snr, ssim, ssim_range_jy_per_pixel, snr_at_scale → {arcsec → dB}}} and
+        {flux_jy, error_jy, model_flux_jy, model_error_jy}}, features → {name → {flux_jy, delta_chi_square, drawn,
+        p_value, rank_p_value, sigma}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness,
+        chi_square → [of each block]}, truth → {snr, log_snr, ssim, ssim_range_jy_per_pixel, snr_at_scale →
+        {arcsec → dB}}} and
         `similarity` → weighting → {'one|other' → S in dB}; what could not be measured is left out.
     versions : dict
         Package → version.

@@ -1,4 +1,4 @@
-"""The pictures of errors in a report: the error of the model, its signal-to-noise ratio with islands, and features tested."""
+"""The pictures of errors in a report: error of the model, signal-to-noise ratio with islands, and features tested."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ SMALLEST, REACH = 8, 1.2  # half side of a picture of a feature, in pixels, and 
 
 
 def error_maps(path, comparison, weighting: str) -> bool:
-    """Draw model, error and S/N at the beam of a weighting, a row for each product with draws; tell whether there were any.
+    """Draw model, error and S/N at the beam of a weighting, a row for each product with draws; tell if there are any.
 
     Parameters
     ----------
     path : str or Path
+        Of the picture.
     comparison : casa_sara.analysis.comparison.Comparison
+        Whose products may have draws.
     weighting : str
+        Of the beam.
     """
     products = [product for product in comparison.products if weighting in product.smoothed_error]
     if not products:
@@ -35,7 +38,8 @@ def error_maps(path, comparison, weighting: str) -> bool:
     top = max(float(product.model.max()) for product in products) / pixel
     factor, sign = prefix(top)
     norm, ratios = LogNorm(top * factor * 10**-DECADES, top * factor), Normalize(0, MOST_RATIO**0.5)
-    sheet = Sheet([product.name for product in products], ["model", "error of the model", f"S/N at the {weighting} beam"],
+    columns = ["model", "error of the model", f"S/N at the {weighting} beam"]
+    sheet = Sheet([product.name for product in products], columns,
                   ny * cell[1] / (nx * cell[0]), celestial(comparison))
     for row, product in enumerate(products):
         for column, image in enumerate((product.model, product.model_error)):
@@ -56,7 +60,7 @@ def error_maps(path, comparison, weighting: str) -> bool:
 
 
 def _numbered(product, comparison):
-    """Return the islands that are numbered: of a product on its own pixels, which those of the comparison are for the first."""
+    """Return the islands to number: of the first product, whose pixels are those of the comparison."""
     if product is not comparison.products[0]:
         return []
     return (product.record.get("islands") or [])[:NUMBERED]

@@ -21,6 +21,15 @@ from casa_sara.runtime import jsonfile
 __all__ = ["Picture", "write_report"]
 
 TEMPLATE = "report.html.j2"
+ERRORS = (
+    "Models, and their errors on the same scale: the root mean square of what new noise does to the model. Right: the "
+    "model smoothed with the beam over the error of that, with contours at 3 (blue) and 5 (red); islands are numbered "
+    "as in the record, the most significant first. Where nothing is detected, model and error are zero."
+)
+FEATURES = (
+    "Models with emission free in the region, and without any there, on one scale, and their difference on its own; "
+    "the table has the probabilities."
+)
 
 
 @dataclass(frozen=True)
@@ -71,8 +80,8 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     folder = Path(folder)
     with replaced(folder) as new:
         jsonfile.save(new / MEASURES, comparison.measures)
-        pictures = [*_sky(comparison, new), *_errors(comparison, new), *_frames(comparison, new), *_residuals(comparison, new),
-                    *_runs(comparison, new)]
+        pictures = [*_sky(comparison, new), *_errors(comparison, new), *_frames(comparison, new),
+                    *_residuals(comparison, new), *_runs(comparison, new)]
         (new / PAGE).write_text(_page(comparison, title, pictures), encoding="utf-8")
     return folder / PAGE
 
@@ -126,14 +135,10 @@ def _errors(comparison, folder) -> list[Picture]:
     for weighting in comparison.beams:
         path = folder / f"errors_{weighting}.png"
         if error_pages.error_maps(path, comparison, weighting):
-            made.append(Picture(path, "sky", f"Errors, {weighting} beam", "Models, and their errors on the same scale: the root "
-                                "mean square of what new noise does to the model. Right: the model smoothed with the beam over "
-                                "the error of that, with contours at 3 (blue) and 5 (red); the islands are numbered as in the "
-                                "record, the most significant first. Where nothing is detected, model and error are zero."))
+            made.append(Picture(path, "sky", f"Errors, {weighting} beam", ERRORS))
     path = folder / "features.png"
     if error_pages.features(path, comparison):
-        made.append(Picture(path, "sky", "Is it real?", "Models with emission free in the region, and without any there, on one "
-                            "scale, and their difference on its own; the table has the probabilities."))
+        made.append(Picture(path, "sky", "Is it real?", FEATURES))
     return made
 
 

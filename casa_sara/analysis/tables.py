@@ -31,7 +31,8 @@ def tables(comparison) -> list[Table]:
     measured = {name: measured[name] for name in names}
     made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS), _blocks(measured),
             *(_regions(measured, *of) for of in REGION_TABLES), _truth(measured),
-            _features(measured), _injected(measured, comparison.beams), _similarity(comparison.measures.get("similarity", {}))]
+            _features(measured), _injected(measured, comparison.beams),
+            _similarity(comparison.measures.get("similarity", {}))]
     return [table for table in made if table is not None]
 
 
@@ -142,9 +143,9 @@ def _features(measured):
     columns = [("flux_jy", "flux", "Jy"), ("delta_chi_square", "Δχ²", ""), ("mean", "Δχ² of draws, mean", ""),
                ("most", "largest", ""), ("p_value", "p-value", ""), ("sigma", "Gaussian", "σ")]
     caption = (
-        "Δχ²: what the fit to the data loses when the model may have no emission in the region; the draws are of the model "
-        "without it and new noise. The p-value is the probability of so large a Δχ² where nothing is, of the scaled χ² "
-        "distribution of the draws; far beyond the largest of them it is an extrapolation."
+        "Δχ²: what the fit to the data loses when the model may have no emission in the region; the draws are of the "
+        "model without it and new noise. The p-value is the probability of so large a Δχ² where nothing is, of the "
+        "scaled χ² distribution of the draws; far beyond the largest of them it is an extrapolation."
     )
     return build("Is it real?", columns, rows, caption)
 

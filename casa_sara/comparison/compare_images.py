@@ -82,6 +82,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     regions = region_masks(request.regions, frame)
     injected = _places_to_inject(request, frame, sets, observed)
     features, of_features = _features(request, sets, observed), region_masks(request.features, frame, "features")
+    repeat = partial(test_features, selection=selection, nthreads=request.nthreads)
     # one operator
     if observed:
         notes.extend(_other_data(sets, selection))
@@ -92,7 +93,8 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     # measure
     products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
     products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec),
-                             features=_tested(one, features, of_features, plane, request, selection)) for product, one in zip(products, sets))
+                             features=_tested(one, features.get(one.name), of_features, plane, repeat))
+                     for product, one in zip(products, sets))
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
     if injected:
@@ -196,32 +198,34 @@ def _product(one, model, residuals, beams, cell_arcsec):
 
 
 def _features(request, sets, observed):
-    """Return the regions to test, by product and name, on the product's own pixels; raise where no run can be repeated."""
+    """Return the regions to test, by product and name, on its own pixels; raise where no run can be repeated."""
     again = [one for one in sets if observed and can_be_repeated(one)]
     if request.features and not again:
-        raise ValueError(f"features = {list(request.features)}: needs vis, and images of tsara with their history among models; "
-                         "images of other imagers cannot be made again")
+        raise ValueError(f"features = {list(request.features)}: needs vis, and images of tsara with their history "
+                         "among models; images of other imagers cannot be made again")
     return {one.name: region_masks(request.features, _frame(one.model.plane.upright()), "features") for one in again}
 
 
-def _tested(one, features, masks, plane, request, selection):
-    """Return the tests of a product's features: name → measures, the models with and without it, and its mask, on the common grid."""
-    if not features.get(one.name):
+def _tested(one, features, masks, plane, repeat):
+    """Return the tests of a product's features: by name, measures, models with and without it and mask."""
+    if not features:
         return {}
-    own = one.model.upright()
-    return {name: (measures_of(result), *(replace(own, pixels=model).flux_on(plane) for model in (result.with_, result.without)),
-                   masks[name])
-            for name, result in test_features(one, features[one.name], selection, request.nthreads).items()}
+    own, tested = one.model.upright(), {}
+    for name, result in repeat(one, features).items():
+        models = [replace(own, pixels=model).flux_on(plane) for model in (result.with_, result.without)]
+        tested[name] = measures_of(result), *models, masks[name]
+    return tested
 
 
 def _errors(one, plane, regions, beams, cell_arcsec):
-    """Return the errors that a product's draws give: of the model, of the smoothed model and of regions; none without draws."""
+    """Return the errors that a product's draws give: of the model, of the smoothed model and of regions."""
     if not one.draws:
         return {}
     draws = read_draws(one.draws)
     if draws.shape != one.model.pixels.shape:
-        raise ValueError(f"models: '{one.draws}' is of an image of {draws.shape[0]} x {draws.shape[1]} pixels, '{one.model.name}' "
-                         f"has {one.model.pixels.shape[0]} x {one.model.pixels.shape[1]}: should be of one run of tsara")
+        (nx, ny), (width, height) = draws.shape, one.model.pixels.shape
+        raise ValueError(f"models: '{one.draws}' is of an image of {nx} x {ny} pixels, '{one.model.name}' has "
+                         f"{width} x {height}: should be of one run of tsara")
 
     def on_plane(difference):
         return replace(one.model, pixels=difference).flux_on(plane)

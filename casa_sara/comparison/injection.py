@@ -104,8 +104,11 @@ def problem_of_run(one, selection: Selection, nthreads: int) -> tuple[Samples, I
     Parameters
     ----------
     one : casa_sara.casa.images.image_sets.ImageSet
+        Of the run.
     selection : Selection
+        Of the visibilities.
     nthreads : int
+        Threads of the numerics.
 
     Returns
     -------

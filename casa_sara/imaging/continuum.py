@@ -285,8 +285,9 @@ def _write(request, plane, images, reconstruction, record, child):
     """Write the products, with the errors that the draws give."""
     draws, jackknife = (reconstruction.draws, reconstruction.jackknife) if reconstruction else (None, None)
     errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
-    write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child,
-                   draws.arrays() if "model.error" in errors else None)
+    if "model.error" in errors:
+        errors["draws"] = draws.arrays()
+    write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child)
 
 
 def split(data, blocks, comm=SERIAL):

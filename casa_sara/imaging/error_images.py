@@ -21,6 +21,7 @@ def error_images(draws: Draws | None, jackknife: Draws | None, fitted: dict, res
     Parameters
     ----------
     draws, jackknife : Draws or None
+        Of a solution.
     fitted : dict
         Beam of the PSF, of :func:`casa_sara.casa.images.restore.fit_beam`.
     restoringbeam : tuple of str or None
@@ -31,10 +32,11 @@ def error_images(draws: Draws | None, jackknife: Draws | None, fitted: dict, res
     Returns
     -------
     dict
-        'model.error' in Jy/pixel and, where there is a restored image, 'image.error' and 'image.jackknife' in Jy/beam, float32
-        (nx, ny); those of which there are two draws or more.
+        'model.error' in Jy/pixel and, where there is a restored image, 'image.error' and 'image.jackknife' in Jy/beam,
+        float32 (nx, ny); those of which there are two draws or more.
     """
-    drawn = {name: one for name, one in (("error", draws), ("jackknife", jackknife)) if one is not None and len(one) >= FEWEST}
+    both = ("error", draws), ("jackknife", jackknife)
+    drawn = {name: one for name, one in both if one is not None and len(one) >= FEWEST}
     errors = {"model.error": draws.error()} if "error" in drawn else {}
     if restoringbeam is not None and drawn:
         *axes, angle = beam_numbers(restored_beam(list(restoringbeam), fitted))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -41,11 +41,15 @@ MOST_TOLD = 20  # islands of emission that the log lists
 
 @dataclass
 class Watch:
-    """When a solution has to end, how long an iteration takes, and where its state is kept, or was."""
+    """When a solution has to end, how long an iteration takes, where its state is kept, or was, and what is done then.
 
-    deadline: Deadline
-    pace: Pace
-    checkpoint: Checkpoint
+    `then` is called as `Control.then`, with what tells whether to stop before the rest.
+    """
+
+    deadline: Deadline = field(default_factory=Deadline)
+    pace: Pace | None = None
+    checkpoint: Checkpoint | None = None
+    then: Callable[..., None] | None = None
 
 
 def checkpoint_of(selection: Selection, grid: ImageGrid, options: SolverOptions, output: Output) -> Checkpoint:
@@ -82,8 +86,7 @@ def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid,
 
 
 def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
-                watch: Watch | None = None, support: np.ndarray | None = None, ranks: RankAssignment = ALONE,
-                then: Callable[..., None] | None = None) -> Reconstruction:
+                watch: Watch | None = None, support: np.ndarray | None = None, ranks: RankAssignment = ALONE) -> Reconstruction:
     """Reconstruct block-sorted visibilities, with progress in the log, Ctrl-C as the wish to stop, and time as a limit.
 
     Parameters
@@ -100,8 +103,6 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         The model is 0 elsewhere.
     ranks : casa_sara.parallel.partition.RankAssignment
         The ranks that share the work; rank 0 decides when to stop.
-    then : callable, optional
-        Called at the end with what tells whether to stop, and as `Control.then`.
 
     Returns
     -------
@@ -115,6 +116,7 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
             preparing()
             return bool(ranks.comm.bcast_numbers([pressed() or bool(watch and watch.deadline.near())])[0])
 
+        then = watch and watch.then
         control = Control(report, stopped, watch.checkpoint if watch else None, _Drawing(progress, preparing),
                           then and partial(then, stopped))
         if not (control.checkpoint and control.checkpoint.state is not None):
@@ -134,7 +136,8 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
 
 def expected_iterations(options: SolverOptions) -> int:
     """A guess of the iterations of a run: those of the solution and those of the draws."""
-    return schedule_of(options).expected_iterations + (options.ndraws + options.jackknife * MOST_GROUPS) * DRAW_ITERATIONS
+    draws = options.ndraws + options.jackknife * MOST_GROUPS
+    return schedule_of(options).expected_iterations + draws * DRAW_ITERATIONS
 
 
 def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd, record):
@@ -190,8 +193,9 @@ def _log_draws(draws, name, checkpoint):
         log.info(f"errors of the model follow from {len(draws)} {name}")
     else:
         what = "errors follow from these" if len(draws) >= FEWEST else "no errors follow from so few"
-        go_on = f"; restart = True makes the others, from '{checkpoint.path}'" if checkpoint and checkpoint.stands else ""
-        log.warn(f"{len(draws)} of {draws.asked} {name} were made before the run was stopped: {what}{go_on}")
+        stands = checkpoint and checkpoint.stands
+        log.warn(f"{len(draws)} of {draws.asked} {name} were made before the run was stopped: {what}"
+                 + (f"; restart = True makes the others, from '{checkpoint.path}'" if stands else ""))
 
 
 class _Preparing:
@@ -318,11 +322,15 @@ def _compare_errors(islands):
     if not ratios:
         return
     middle = float(np.median(ratios))
-    differ = middle > DIFFER or middle < 1 / DIFFER
-    (log.warn if differ else log.info)(
-        f"errors of the fluxes of islands by the jackknife over snapshots are {middle:.2g} times those by the bootstrap (median of "
-        f"{len(ratios)})" + (": more than the noise explains, as calibration errors that differ between snapshots would be; the larger "
-                             "errors are to be believed" if middle > DIFFER else ""))
+    line = (f"errors of the fluxes of islands by the jackknife over snapshots are {middle:.2g} times those by the "
+            f"bootstrap (median of {len(ratios)})")
+    if middle > DIFFER:
+        log.warn(f"{line}: more than the noise explains, as of calibration errors that differ between snapshots; "
+                 "believe the larger ones")
+    elif middle < 1 / DIFFER:
+        log.warn(f"{line}: less than the noise alone should give")
+    else:
+        log.info(line)
 
 
 def _shortened(angle, digits):

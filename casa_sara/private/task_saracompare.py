@@ -19,7 +19,8 @@ from casa_sara.version import __version__
 __all__ = ["saracompare"]
 
 LISTS = ("models", "names", "regions", "frames", "inject", "features")
-OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust", "inject", "injectflux", "features")  # what has no effect without vis
+# what has no effect without vis
+OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust", "inject", "injectflux", "features")
 
 
 def saracompare(**parameters: Any) -> dict[str, Any]:

@@ -59,6 +59,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
                           tuple(parameters["uvtaper"]))
     options = _solver_options(parameters, comm)
     _refuse_for_cubes(parameters)
+    _check_errors(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"] and comm.size > 1:
         raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is in "
@@ -79,8 +80,8 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
 
 def _prepare(parameters, selection, grid, stack):
     """Take the imagename for as long as the stack lasts, and return the options of the output."""
-    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"])
-                    + parameters["jackknife"])
+    more = 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"]) + parameters["jackknife"]
+    check_imagename(parameters["imagename"], grid.shape, more)
     stack.enter_context(one_run_of(parameters["imagename"]))
     recover_products(parameters["imagename"])
     output = _output(parameters)
@@ -172,12 +173,22 @@ def _refuse_for_cubes(parameters):
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
-    for name, right in (("ndraws", 0), ("jackknife", False)):
-        if parameters[name]:
-            raise ValueError(f"{name} = {parameters[name]} with specmode = 'cube': errors are found for continuum images only; "
-                             f"should be {right}")
     if parameters["report"]:
         raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be False")
+
+
+def _check_errors(parameters):
+    """Raise where errors are asked for that cannot be found."""
+    for name, right in (("ndraws", 0), ("jackknife", False)):
+        value = parameters[name]
+        if value and parameters["specmode"] == "cube":
+            raise ValueError(f"{name} = {value} with specmode = 'cube': errors are found for continuum images only; "
+                             f"should be {right}")
+        if value and parameters["niter"] == 0:
+            raise ValueError(f"{name} = {value} with niter = 0: errors are those of a model that was solved; should be "
+                             f"{right}")
+    if parameters["ndraws"] == 1:
+        raise ValueError("ndraws = 1: an error takes two draws or more; should be 0, or at least 2 (20 are usual)")
 
 
 def _check_stokes(parameters):
@@ -265,11 +276,6 @@ def _solver_options(parameters, comm):
     if parameters["databound"] == "fixed" and not parameters["l2bound"]:
         raise ValueError(f"l2bound = {parameters['l2bound']!r}: databound='fixed' needs positive noise levels, one for all "
                          "blocks or one for each, relative to the MS weights")
-    if parameters["ndraws"] == 1 or parameters["ndraws"] and parameters["niter"] == 0:
-        raise ValueError(f"ndraws = {parameters['ndraws']} with niter = {parameters['niter']}: an error takes two draws or more "
-                         "of a model that was solved; should be 0, or at least 2 (20 are usual)")
-    if parameters["jackknife"] and parameters["niter"] == 0:
-        raise ValueError("jackknife = True with niter = 0: an error takes a model that was solved; should be False")
     if not parameters["regscale"] > 0:
         raise ValueError(f"regscale = {parameters['regscale']!r}: should be positive; 1 is the automatic weight of the prior")
     names = set(SolverOptions.__dataclass_fields__) - {"nthreads"}

@@ -29,7 +29,7 @@ class Bootstrap:
     """Draws of the model x̂ of a solution: y* = Φx̂ + σ_j n with new noise n at the levels σ_j found, solved as y was.
 
     A draw begins where the draw before has ended, the first one with the solution, and goes through the last steps of
-    Algorithm 2: three problems of 30 iterations, with support and weights found anew between them.  The noise levels stay.
+    Algorithm 2: three problems of 30 iterations, with support and weights found anew between them.  Noise levels stay.
 
     Parameters
     ----------
@@ -119,16 +119,18 @@ class Bootstrap:
 
     def state(self) -> dict[str, Any]:
         """Return what :meth:`run` goes on from, beside the states of the iteration and of the bounds."""
-        return dict(scale=self.scale, model=self.model, threshold=self.threshold, draws=self.draws.arrays(), done=self.done)
+        return dict(scale=self.scale, model=self.model, threshold=self.threshold, done=self.done,
+                    draws=self.draws.arrays())
 
 
 @dataclass
 class Jackknife(Bootstrap):
     """Solutions without one group of blocks each: Var x̂ = (g − 1)/g Σ (x_k − x̂)² over the g groups.
 
-    Calibration errors that differ from snapshot to snapshot count in full, and so does what the coverage of a group tells of
-    the sky. The noise of the blocks left out is taken to be 10⁵ times what was found. Parameters are those of `Bootstrap`;
-    `draws` has as many as there are groups. It is run before the bootstrap, which replaces the data.
+    Calibration errors that differ from snapshot to snapshot count in full, and so does what only the coverage of a
+    group tells of the sky.  The noise of the blocks left out is taken to be 10⁵ times what was found.  Parameters are
+    those of `Bootstrap`; `draws` asks for as many as there are groups.  It is run before the bootstrap, which replaces
+    the data.
     """
 
     @property
@@ -154,6 +156,6 @@ def jackknife_groups(blocks: int) -> int:
         They are too few.
     """
     if blocks < FEWEST_GROUPS:
-        raise ValueError(f"jackknife = True: there are {blocks} blocks of data; a jackknife over snapshots needs {FEWEST_GROUPS} "
-                         "or more. blocks can divide the data further")
+        raise ValueError(f"jackknife = True: there are {blocks} blocks of data; a jackknife over snapshots needs "
+                         f"{FEWEST_GROUPS} or more. blocks can divide the data further")
     return min(blocks, MOST_GROUPS)

@@ -1,4 +1,4 @@
-"""The draws of a bootstrap: how models of the same sky and other noise differ from the model, and what follows for errors."""
+"""The draws of a bootstrap: how models of one sky and other noise differ from the model, and the errors that follow."""
 
 from __future__ import annotations
 
@@ -121,7 +121,8 @@ class Draws:
         places = np.cumsum(arrays["counts"])[:-1]
         parts = {name: [np.array(part) for part in np.split(arrays[name], places)] if len(arrays["scales"]) else []
                  for name in ("pixels", "values")}
-        return cls(tuple(int(n) for n in arrays["shape"]), int(arrays["asked"]), **parts, scales=arrays["scales"].tolist())
+        nx, ny = (int(n) for n in arrays["shape"])
+        return cls((nx, ny), int(arrays["asked"]), **parts, scales=arrays["scales"].tolist())
 
 
 def read_draws(path: str) -> Draws:
@@ -130,6 +131,7 @@ def read_draws(path: str) -> Draws:
     Parameters
     ----------
     path : str
+        Of the file.
 
     Returns
     -------

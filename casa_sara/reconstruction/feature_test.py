@@ -1,4 +1,4 @@
-"""The test whether the data need emission in a region: the solution without it against that with it, and a bootstrap of both."""
+"""The test whether the data need emission in a region: solutions without it and with it, and a bootstrap of both."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import gammaincc, ndtri
+from scipy.special import gammaincc, ndtr, ndtri
 
 from casa_sara.reconstruction.bootstrap import INTERVAL, SEED, STAGES
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
@@ -50,16 +50,18 @@ class FeatureResult:
 
     @property
     def p_value(self) -> float:
-        """Probability of a T not less than this without emission, of the scaled χ² with the mean and variance of the draws.
+        """Probability of a T not less than this without emission: of the scaled χ² with mean and variance of the draws.
 
-        It is what lets a few draws tell of far smaller probabilities than one in their number, by extrapolation; no less than
-        1e-300.  The prior may let T be negative: the distribution then begins at the least of the draws.
+        It is what lets a few draws tell of far smaller probabilities than one in their number, by extrapolation.  The
+        prior may let T be negative: the distribution then begins at the least of the draws.  No p-value is less than that
+        of √T standard deviations, with which emission is detected whose place and shape are known (nor than 1e-300).
         """
         least = min(float(np.min(self.drawn)), 0.0)
         mean, variance = float(np.mean(self.drawn)) - least, float(np.var(self.drawn, ddof=1))
         if not (mean > 0 and variance > 0):
             return self.rank_p_value
-        return max(float(gammaincc(mean**2 / variance, max(self.change - least, 0.0) * mean / variance)), LEAST_P)
+        of_draws = float(gammaincc(mean**2 / variance, max(self.change - least, 0.0) * mean / variance))
+        return max(of_draws, float(ndtr(-np.sqrt(max(self.change, 0.0)))), LEAST_P)
 
     @property
     def sigma(self) -> float:
@@ -70,8 +72,8 @@ class FeatureResult:
 class FeatureTest:
     """Tests of regions after a solution.
 
-    The model is solved with the region's pixels kept at 0, and with all of them free; elsewhere both have the support of the
-    solution. The same is done with draws y* = Φx₀ + σ_j n of the model x₀ without.
+    The model is solved with the region's pixels kept at 0, and with all of them free; elsewhere both have the support
+    of the solution. The same is done with draws y* = Φx₀ + σ_j n of the model x₀ without.
 
     Parameters
     ----------
@@ -97,7 +99,9 @@ class FeatureTest:
         Parameters
         ----------
         region : bool (nx, ny)
+            Where the emission is that may not be real.
         draws : int
+            How many draws of the model without it.
         stopped : callable
             Asked after every iteration; True raises KeyboardInterrupt.
         progress : callable
@@ -125,8 +129,8 @@ class FeatureTest:
             np.add(predicted, noise, out=ppd.vis)
             progress(number)
             drawn.append(self._change(supports, points, stopped)[0])
-        unit = np.float32(ppd.unit_jy)
-        return FeatureResult(change, np.array(drawn), float(with_[region].sum(dtype=float) * unit), without * unit, with_ * unit)
+        without, with_ = (model * np.float32(ppd.unit_jy) for model in (without, with_))
+        return FeatureResult(change, np.array(drawn), float(with_[region].sum(dtype=float)), without, with_)
 
     def _change(self, supports, points, stopped):
         """Return T of the present data, and the models without and with the region."""

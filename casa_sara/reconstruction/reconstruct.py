@@ -54,8 +54,8 @@ class Control:
         Keeps the state now and then; where it holds a `state` that was read, the solution goes on from that. A solution
         whose NNLS fit was cut short is not kept: it is not on the way to the same image. Only rank 0 reads and writes it.
     drawn : callable
-        Called with 'jackknife' and its `Draws`, then with 'draws' and those of the bootstrap: before the first one of each,
-        and after every one.
+        Called with 'jackknife' and its `Draws`, then with 'draws' and those of the bootstrap: before the first one of
+        each, and after every one.
     then : callable, optional
         Called at the end with the iteration, its bounds and its record, all as the solution has left them.
     """
@@ -148,14 +148,12 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     Raises
     ------
     ValueError
-        Noise levels that are neither one for all blocks nor one for each.
+        Noise levels that are neither one for all blocks nor one for each; too few blocks for a jackknife.
     CheckpointError
         The state that was read is not one of these data.
     """
     comm, checkpoint = ranks.comm, control.checkpoint
-    check_l2bound(options, len(samples.offsets) - 1)
-    if options.jackknife:
-        jackknife_groups(len(samples.offsets) - 1)
+    _check_blocks(options, len(samples.offsets) - 1)
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(comm.mean(samples.data.weight, dtype=float) ** -0.5)
     problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support, comm=comm,
@@ -179,6 +177,13 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         if not _draw(solution, name, resampling, control, layout, ranks):
             break
     return solution.result
+
+
+def _check_blocks(options, blocks):
+    """Raise where options and number of blocks do not go together."""
+    check_l2bound(options, blocks)
+    if options.jackknife:
+        jackknife_groups(blocks)
 
 
 def _identify(checkpoint, samples, layout, grid, support, comm):
@@ -213,16 +218,18 @@ def _begin_draws(solution, record, options):
                               ("draws", Bootstrap, options.ndraws)):
         if asked:
             draws = Draws(ppd.model.shape, asked if ppd.model.any() else 0)
-            solution.resamplings[name] = kind(ppd, solution.bounds, _support(options), scale, ppd.model.copy(), ppd.threshold, draws)
+            solution.resamplings[name] = kind(ppd, solution.bounds, _support(options), scale, ppd.model.copy(),
+                                              ppd.threshold, draws)
 
 
 def _support(options):
     """Return the support of a solution that has found one, None where nothing confines the model."""
-    return SignificantSupport(options.significance, begun=True) if schedule_of(options).confined else None
+    confined = options.significance > 0 and options.nreweights > 0
+    return SignificantSupport(options.significance, begun=True) if confined else None
 
 
 def _draw(solution, name, resampling, control, layout, ranks):
-    """Make the draws of one kind, keeping the state now and then, and add the errors of islands; return whether all are made."""
+    """Make the draws of one kind, keeping the state, and add the errors of islands; return whether all are made."""
     draws = resampling.draws
     drawn = partial(control.drawn, name)
     drawn(draws)
@@ -351,9 +358,9 @@ def _resume_draws(solution, options, result, states):
     for name, state in states.items():
         draws = Draws.of(state["draws"])
         setattr(solution.result, name, draws)
-        solution.resamplings[name] = (Jackknife if name == "jackknife" else Bootstrap)(
-            solution.ppd, solution.bounds, _support(options), state["scale"], np.array(state["model"]), state["threshold"], draws,
-            state["done"])
+        kind, model = Jackknife if name == "jackknife" else Bootstrap, np.array(state["model"])
+        solution.resamplings[name] = kind(solution.ppd, solution.bounds, _support(options), state["scale"], model,
+                                          state["threshold"], draws, state["done"])
 
 
 def check_l2bound(options: SolverOptions, blocks: int) -> None:

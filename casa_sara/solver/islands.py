@@ -65,7 +65,8 @@ def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list
     -------
     list of dict
         `x`, `y` (pixel of the centroid), `x_peak`, `y_peak` (of the brightest pixel), `flux_jy`, `flux_error_jy`, `snr`
-        (‖Σ^{−½}Φx_i‖, the square root of the χ² that the island explains; the error of the flux is that of its strength, its shape being known), `pixels` (area) and
+        (‖Σ^{−½}Φx_i‖, the square root of the χ² that the island explains; the error of the flux is that of its
+        strength, its shape being known), `pixels` (area) and
         `fwhm_pixels` (of a circular Gaussian of the same second moments; 0 for a point between pixels, whose pixels have none).
     """
     labels, number = _labelled(model)

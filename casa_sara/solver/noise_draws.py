@@ -17,9 +17,11 @@ def draw_noise(ppd: AdaptivePPD, rng: np.random.Generator, levels: np.ndarray, o
     Parameters
     ----------
     ppd : AdaptivePPD
+        Of whose data the noise is.
     rng : numpy.random.Generator
         In the same state on all ranks.
     levels : float (d,)
+        Of each block.
     out : complex (M,)
         Of this rank's samples.
     """
@@ -30,7 +32,7 @@ def draw_noise(ppd: AdaptivePPD, rng: np.random.Generator, levels: np.ndarray, o
 
 
 def _normal(rng, begin, count, size):
-    """Return `count` of `size` standard normal numbers, from number `begin` on; all are drawn, as one rank alone does."""
+    """Return `count` of `size` standard normal numbers, from number `begin` on; all are drawn, as by one rank alone."""
     if count == size:
         return rng.standard_normal(size)
     chosen = np.empty(count)

@@ -97,7 +97,7 @@ def _older(imagename):
     return [path for path in existing_products(imagename) if not path.endswith(REPORT)]
 
 
-def write_products(output, plane, images, sumwt, beam, record=None, child=None, draws=None):
+def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     """Write the products of a run, as tclean does.
 
     Parameters
@@ -108,7 +108,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None, 
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
         residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'model.error', 'image.error' and
-        'image.jackknife' where there are.
+        'image.jackknife' where there are; 'draws' is a dict of arrays, kept as `DRAWS`.
     sumwt : float, or one for each channel
     beam : dict
         Of `restore.fit_beam`, or a list with one for each channel.
@@ -116,14 +116,13 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None, 
         Kept as `RECORD`.
     child : Popen, optional
         Of `child.waiting_child`, to write in.
-    draws : dict of arrays, optional
-        Kept as `DRAWS`.
 
     Raises
     ------
     OSError
         The images could not be written, as on a full disk; everything is as it was before.
     """
+    images, draws = {name: image for name, image in images.items() if name != "draws"}, images.get("draws")
     more = 2 * output.pbcor + sum(name not in ("psf", "residual", "model") for name in images)
     check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
@@ -156,8 +155,8 @@ def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor
     if "model.error" in images:
         write_image(root + ".model.error", images["model.error"], plane, unit="Jy/pixel")
     for name in {"image.error", "image.jackknife"} & images.keys():
-        write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored_beam(list(restoringbeam), beam),
-                    masked=plane.masks_all)
+        restored = restored_beam(list(restoringbeam), beam)
+        write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored, masked=plane.masks_all)
     for path in existing_products(root):
         with opened("image", path) as ia:
             ia.sethistory(origin="tsara", history=list(history))

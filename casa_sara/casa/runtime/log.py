@@ -127,7 +127,7 @@ class Progress:
         self._draw(line, fraction)
 
     def draw(self, name, number, asked):
-        """Report that so many draws of this name are made, 0 before the first; the time left follows from those made since."""
+        """Report that so many draws of this name are made, 0 before the first, and the time that the others take."""
         now = time.monotonic()
         begin, before = self._first_draws.setdefault(name, (now, number))
         left = f", about {_spell((now - begin) * (asked - number) / (number - before))} left" if number > before else ""
