@@ -44,7 +44,9 @@ PACKAGES = {
     "casa.images": {"casa.ms", "casa.runtime", "options", "runtime", "version", "numpy", "scipy", "astropy", *CASA},
     "casa.ms": {"casa.runtime", "data", "parallel", "runtime", "numpy", "scipy", "astropy", *CASA},
     "casa.runtime": {"numpy", *CASA},
-    "reconstruction": {"data", "operators", "options", "parallel", "runtime", "solver", "numpy", "numba", "llvmlite"},
+    "reconstruction": {
+        "data", "operators", "options", "parallel", "runtime", "solver", "numpy", "scipy", "numba", "llvmlite",
+    },
     "solver": {"options", "parallel", "runtime", "numpy", "scipy"},
     "operators": {"options", "parallel", "runtime", "numpy", "scipy", "finufft", "ducc0", "numba", "llvmlite", "pywt"},
     "data": {"parallel", "numpy"},
