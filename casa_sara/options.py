@@ -128,6 +128,8 @@ class SolverOptions:
     finalreltol: float = 3e-4
     regscale: float = 1.0
     significance: float = 5.0
+    ndraws: int = 0
+    jackknife: bool = False
     nthreads: int = 1
     averaging: bool = True  # no task parameter
 
@@ -197,4 +199,5 @@ class Comparing:
     frames: tuple[str, ...] = ()
     inject: tuple[str, ...] = ()
     injectflux: float = 0.0
+    features: tuple[str, ...] = ()
     nthreads: int = 1

@@ -37,7 +37,7 @@ PACKAGES = {
     "casa.images": {"numpy", "scipy", "astropy", *CASA},
     "casa.ms": {"numpy", "scipy", "astropy", *CASA},
     "casa.runtime": {"numpy", *CASA},
-    "reconstruction": {"numpy", "numba", "llvmlite"},
+    "reconstruction": {"numpy", "scipy", "numba", "llvmlite"},
     "solver": {"numpy", "scipy"},
     "operators": {"numpy", "scipy", "finufft", "ducc0", "numba", "llvmlite", "pywt"},
     "data": {"numpy"},

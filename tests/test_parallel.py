@@ -30,6 +30,7 @@ SKY = [(1.0, -12 * ARCSEC, 7 * ARCSEC), (0.4, 9 * ARCSEC, -10 * ARCSEC), (0.5, 0
 GRID = dict(imsize=72, cell="0.9arcsec", datacolumn="data", nthreads=1)
 LIMIT = 300  # s; a quiet machine needs a tenth
 AGREE = 1e-5
+ERRORS_AGREE = 1e-3  # differences of images, in single precision
 WILD = 1e4
 
 mpi = pytest.mark.skipif(shutil.which("mpirun") is None or importlib.util.find_spec("mpi4py") is None
@@ -71,8 +72,7 @@ def alone(vis, folder):
 def _runs(vis, folder, **more):
     """The runs that all numbers of ranks do.
 
-    Re-weighted; with hard bounds, equal blocks and uniform weights; and with w-term, spectrum, mask and a block by
-    name.
+    Re-weighted; with hard bounds, equal blocks and uniform weights; and with w-term, spectrum, mask, a block, draws.
     """
     folder.mkdir(exist_ok=True)
     common = dict(vis=vis, **GRID, **more)
@@ -81,7 +81,7 @@ def _runs(vis, folder, **more):
         "hard": dict(common, imagename=str(folder / "hard"), niter=12, nreweights=0, databound="weights", blocks=3,
                      weighting="uniform"),
         "rich": dict(common, imagename=str(folder / "rich"), niter=12, gridder="wproject", spectralindex=-0.7,
-                     mask="circle[[30pix,34pix],18pix]", blocks=["scan=2"]),
+                     mask="circle[[30pix,34pix],18pix]", blocks=["scan=2"], ndraws=2),
     }
 
 
@@ -147,6 +147,9 @@ def test_two_ranks_find_what_one_process_finds(two, alone, folder):
     for step, name in ((0, "whole"), (2, "hard"), (4, "rich")):
         _same_findings(said[step], alone[name], 2)
         _same_images(folder / "two" / name, folder / "alone" / name)
+    for product in ("model.error", "image.error"):
+        found, expected = (pixels(folder / ranks / f"rich.{product}") for ranks in ("two", "alone"))
+        assert expected.any() and np.abs(found - expected).max() <= ERRORS_AGREE * expected.max()
     assert alone["whole"]["wild"] == [700] and len(alone["hard"]["bounds"]) == 3
     assert 0 < alone["whole"]["averages"] < alone["whole"]["visibilities"] / 5 and 0 < alone["rich"]["averages"]
     assert alone["whole"]["stopcode"] == ITERATION_LIMIT

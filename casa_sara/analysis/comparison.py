@@ -30,6 +30,11 @@ class Product:
     record : dict
         What tsara recorded of the run ('history', 'bounds', 'blocks', 'reweightings' as in its return dictionary);
         empty for other imagers.
+    model_error, smoothed_error, region_errors
+        From the draws of a bootstrap, where there are any: the error of the model, Jy/pixel; that of the model smoothed
+        with the beam of each weighting, Jy/pixel; and that of its flux in each region, Jy.
+    features : dict
+        Of each region tested: its measures, the models with and without emission there, Jy/pixel, and its mask.
     """
 
     name: str
@@ -38,6 +43,10 @@ class Product:
     restored: dict[str, np.ndarray] = field(default_factory=dict)
     parameters: dict[str, str] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
+    model_error: np.ndarray | None = None
+    smoothed_error: dict[str, np.ndarray] = field(default_factory=dict)
+    region_errors: dict[str, float] = field(default_factory=dict)
+    features: dict[str, tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -63,8 +72,10 @@ class Comparison:
         Plain numbers, strings, lists and dicts only:
         `products` → name → {flux_jy, peak_jy_per_pixel, negative_jy, mdr, fwhm_recovered_arcsec, injected → {source →
         {injected_jy, flux_jy, offset_arcsec, fwhm_arcsec, fwhm_in_beams → {weighting → ratio}}}, regions → {name →
-        {flux_jy, error_jy}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness, chi_square →
-        [of each block]}, truth → {snr, log_snr, ssim, ssim_range_jy_per_pixel, snr_at_scale → {arcsec → dB}}} and
+        {flux_jy, error_jy, model_flux_jy, model_error_jy}}, features → {name → {flux_jy, delta_chi_square, drawn,
+        p_value, rank_p_value, sigma}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness,
+        chi_square → [of each block]}, truth → {snr, log_snr, ssim, ssim_range_jy_per_pixel, snr_at_scale →
+        {arcsec → dB}}} and
         `similarity` → weighting → {'one|other' → S in dB}; what could not be measured is left out.
     versions : dict
         Package → version.

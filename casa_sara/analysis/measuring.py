@@ -82,6 +82,10 @@ def measure(products: Sequence[Product], cell_arcsec: tuple[float, float], beams
         if product.name in chi_square and "natural" in entry:
             entry["natural"]["chi_square"] = [float(value) for value in chi_square[product.name]]
         entry["regions"] = {name: _region(product, mask, cell_arcsec, beams) for name, mask in regions.items()}
+        for name, error in product.region_errors.items():
+            entry["regions"][name]["model_error_jy"] = error
+        if product.features:
+            entry["features"] = {name: dict(test[0]) for name, test in product.features.items()}
         if truth is not None:
             entry |= _against_truth(product, truth, cell_arcsec, beams)
         measured[product.name] = entry

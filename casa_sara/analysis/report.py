@@ -10,7 +10,7 @@ import jinja2
 import numpy as np
 from PIL import Image
 
-from casa_sara.analysis import animation, convergence, diagnostics, pages
+from casa_sara.analysis import animation, convergence, diagnostics, error_pages, pages
 from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.folder import MEASURES, PAGE, replaced
 from casa_sara.analysis.sheets import DPI
@@ -21,6 +21,15 @@ from casa_sara.runtime import jsonfile
 __all__ = ["Picture", "write_report"]
 
 TEMPLATE = "report.html.j2"
+ERRORS = (
+    "Models, and their errors on the same scale: the root mean square of what new noise does to the model. Right: the "
+    "model smoothed with the beam over the error of that, with contours at 3 (blue) and 5 (red); islands are numbered "
+    "as in the record, the most significant first. Where nothing is detected, model and error are zero."
+)
+FEATURES = (
+    "Models with emission free in the region, and without any there, on one scale, and their difference on its own; "
+    "the table has the probabilities."
+)
 
 
 @dataclass(frozen=True)
@@ -72,8 +81,8 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     folder = Path(folder)
     with replaced(folder) as new:
         jsonfile.save(new / MEASURES, comparison.measures)
-        pictures = [*_sky(comparison, new), *_frames(comparison, new), *_residuals(comparison, new),
-                    *_runs(comparison, new)]
+        pictures = [*_sky(comparison, new), *_errors(comparison, new), *_frames(comparison, new),
+                    *_residuals(comparison, new), *_runs(comparison, new)]
         (new / PAGE).write_text(_page(comparison, title, pictures), encoding="utf-8")
     return folder / PAGE
 
@@ -118,6 +127,19 @@ def _sky(comparison, folder) -> list[Picture]:
         made.append(Picture(path, "sky", "Differences", f"Models minus that of {what}, as they are and smoothed with "
                             "each CLEAN beam. Red: more than there; blue: less. The scales are linear and end at the "
                             "99.8th percentile."))
+    return made
+
+
+def _errors(comparison, folder) -> list[Picture]:
+    """Draw the errors that draws give, and the features that were tested."""
+    made = []
+    for weighting in comparison.beams:
+        path = folder / f"errors_{weighting}.png"
+        if error_pages.error_maps(path, comparison, weighting):
+            made.append(Picture(path, "sky", f"Errors, {weighting} beam", ERRORS))
+    path = folder / "features.png"
+    if error_pages.features(path, comparison):
+        made.append(Picture(path, "sky", "Is it real?", FEATURES))
     return made
 
 

@@ -15,8 +15,9 @@ WEIGHTINGS = ("natural", "briggs")
 
 
 REGION_TABLES = (
-    ("model_flux_jy", "Regions, flux of the models", "Sum of the model within each region."),
-    ("flux_jy", "Regions, flux of the restored images",
+    ("model_flux_jy", "model_error_jy", "Regions, flux of the models",
+     "Sum of the model within each region; the error is that of the draws of tsara's ndraws."),
+    ("flux_jy", "error_jy", "Regions, flux of the restored images",
      "Within each region; a region smaller than the beam holds a part of its source. The error is that of the noise."),
 )
 
@@ -38,7 +39,8 @@ def tables(comparison: Comparison) -> list[Table]:
     measured = {name: measured[name] for name in names}
     made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS), _blocks(measured),
             *(_regions(measured, *of) for of in REGION_TABLES), _truth(measured),
-            _injected(measured, comparison.beams), _similarity(comparison.measures.get("similarity", {}))]
+            _features(measured), _injected(measured, comparison.beams),
+            _similarity(comparison.measures.get("similarity", {}))]
     return [table for table in made if table is not None]
 
 
@@ -108,8 +110,8 @@ def _blocks(measured):
     return build("χ² of the blocks", columns, entries, caption)
 
 
-def _regions(measured, key, title, caption):
-    """Flux in every region; `key` is that of the models, or of the restored images with its error."""
+def _regions(measured, key, error, title, caption):
+    """Flux in every region; `key` and `error` are those of the models, or of the restored images."""
     found = {
         name: {region: entry for region, entry in one.get("regions", {}).items() if key in entry}
         for name, one in measured.items()
@@ -120,7 +122,6 @@ def _regions(measured, key, title, caption):
     rows = []
     for region in regions:
         entries = [one.get(region, {}) for one in found.values()]
-        error = "error_jy" if key == "flux_jy" else ""
         rows.append((region, *(_with_error(entry.get(key), entry.get(error)) for entry in entries)))
     return Table(title, ("", *measured), ("", *["Jy"] * len(measured)), tuple(rows), caption)
 
@@ -150,6 +151,22 @@ def _truth(measured):
         "the peak of the truth. SNR at a scale: both smoothed to that width."
     )
     return build("Against the truth", columns, flat, caption)
+
+
+def _features(measured):
+    """The tests of structures."""
+    rows = {f"{name}, {feature}": test | {"mean": float(np.mean(test["drawn"])), "most": float(np.max(test["drawn"]))}
+            for name, entry in measured.items() for feature, test in entry.get("features", {}).items()}
+    if not rows:
+        return None
+    columns = [("flux_jy", "flux", "Jy"), ("delta_chi_square", "Δχ²", ""), ("mean", "Δχ² of draws, mean", ""),
+               ("most", "largest", ""), ("p_value", "p-value", ""), ("sigma", "Gaussian", "σ")]
+    caption = (
+        "Δχ²: what the fit to the data loses when the model may have no emission in the region; the draws are of the "
+        "model without it and new noise. The p-value is the probability of so large a Δχ² where nothing is, of the "
+        "scaled χ² distribution of the draws; far beyond the largest of them it is an extrapolation."
+    )
+    return build("Is it real?", columns, rows, caption)
 
 
 def _injected(measured, beams):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 
 import numpy as np
@@ -15,9 +17,11 @@ from casa_sara.casa.images.fits_files import is_fits
 from casa_sara.casa.images.image_sets import check_same_data, data_names, read_frames, read_image_set
 from casa_sara.casa.images.sky_image import read_sky_image
 from casa_sara.casa.runtime import log
+from casa_sara.comparison.features import measures_of, test_features
 from casa_sara.comparison.injection import Injection, can_be_repeated, recover
 from casa_sara.comparison.observed import Observed
 from casa_sara.options import Comparing, Selection
+from casa_sara.reconstruction.draws import read_draws
 from casa_sara.version import __version__
 
 __all__ = ["compare_images"]
@@ -70,6 +74,8 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     frame = _frame(plane)
     regions = region_masks(request.regions, frame)
     injected = _places_to_inject(request, frame, sets, observed)
+    features, of_features = _features(request, sets, observed), region_masks(request.features, frame, "features")
+    repeat = partial(test_features, selection=selection, nthreads=request.nthreads)
     # one operator
     if observed:
         notes.extend(_other_data(sets, selection))
@@ -79,6 +85,9 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         beams, residuals, chi_square = *_beside(sets, plane, notes), {}
     # measure
     products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
+    products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec),
+                             features=_tested(one, features.get(one.name), of_features, plane, repeat))
+                     for product, one in zip(products, sets))
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
     if injected:
@@ -179,6 +188,51 @@ def _product(one, model, residuals, beams, cell_arcsec):
         smoothed = metrics.smooth(model, axes, angle, cell_arcsec) * metrics.beam_pixels(axes, cell_arcsec)
         restored[weighting] = smoothed + residual
     return Product(one.name, model, residuals, restored, dict(one.parameters), dict(one.record))
+
+
+def _features(request, sets, observed):
+    """Return the regions to test, by product and name, on its own pixels; raise where no run can be repeated."""
+    again = [one for one in sets if observed and can_be_repeated(one)]
+    if request.features and not again:
+        raise ValueError(f"features = {list(request.features)}: needs vis, and images of tsara with their history "
+                         "among models; images of other imagers cannot be made again")
+    return {one.name: region_masks(request.features, _frame(one.model.plane.upright()), "features") for one in again}
+
+
+def _tested(one, features, masks, plane, repeat):
+    """Return the tests of a product's features: by name, measures, models with and without it and mask."""
+    if not features:
+        return {}
+    own, tested = one.model.upright(), {}
+    for name, result in repeat(one, features).items():
+        models = [replace(own, pixels=model).flux_on(plane) for model in (result.with_, result.without)]
+        tested[name] = measures_of(result), *models, masks[name]
+    return tested
+
+
+def _errors(one, plane, regions, beams, cell_arcsec):
+    """Return the errors that a product's draws give: of the model, of the smoothed model and of regions."""
+    if not one.draws:
+        return {}
+    draws = read_draws(one.draws)
+    if draws.shape != one.model.pixels.shape:
+        (nx, ny), (width, height) = draws.shape, one.model.pixels.shape
+        raise ValueError(f"models: '{one.draws}' is of an image of {nx} x {ny} pixels, '{one.model.name}' has "
+                         f"{width} x {height}: should be of one run of tsara")
+
+    def on_plane(difference):
+        return replace(one.model, pixels=difference).flux_on(plane)
+
+    def fluxes(difference):
+        flux = on_plane(difference)
+        return np.array([flux[mask].sum() for mask in regions.values()])
+
+    def smoothed(difference, major, minor, angle):
+        return metrics.smooth(on_plane(difference), (major, minor), angle, cell_arcsec)
+
+    return dict(model_error=draws.error(on_plane), region_errors=dict(zip(regions, draws.error(fluxes).tolist())),
+                smoothed_error={name: draws.error(partial(smoothed, major=beam[0], minor=beam[1], angle=beam[2]))
+                                for name, beam in beams.items()})
 
 
 def _support(request, plane, frame, models, truth, beam, notes):

@@ -21,7 +21,7 @@ from casa_sara.options import ImageGrid, Selection, SolverOptions
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.solver.record import STOPPED_BY_USER
 
-__all__ = ["Injection", "can_be_repeated", "recover", "spectral_index_of"]
+__all__ = ["Injection", "can_be_repeated", "problem_of_run", "recover", "spectral_index_of"]
 
 ARCSEC = np.radians(1 / 3600)
 
@@ -102,8 +102,25 @@ def recover(one, injection: Injection, selection: Selection, nthreads: int = 1) 
     return found
 
 
-def _repeat(one, places, flux, selection, nthreads):
-    """Return the models of the same run on the visibilities as they are, and with the sources."""
+def problem_of_run(one, selection: Selection, nthreads: int) -> tuple[Samples, ImageGrid, SolverOptions]:
+    """Return what a run of tsara has solved, by the parameters in the history of its images.
+
+    Parameters
+    ----------
+    one : casa_sara.casa.images.image_sets.ImageSet
+        Of the run.
+    selection : Selection
+        Of the visibilities.
+    nthreads : int
+        Threads of the numerics.
+
+    Returns
+    -------
+    samples : Samples
+    grid : ImageGrid
+    options : SolverOptions
+        Without draws.
+    """
     plane = one.model.plane.upright()
     longitude, latitude = (float(angle) for angle in plane.centre)
     grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad",
@@ -113,8 +130,13 @@ def _repeat(one, places, flux, selection, nthreads):
     block_of_sample, _ = divide(data, _blocks(one.parameters.get("blocks", "0")))
     data, offsets = sort_into_blocks(data, block_of_sample)
     noise, options = noise_from_differences(data, offsets), _options(one.parameters, nthreads)
-    samples = Samples(data, offsets, density_of(data, selection, grid, options), noise)
-    models = []
+    return Samples(data, offsets, density_of(data, selection, grid, options), noise), grid, options
+
+
+def _repeat(one, places, flux, selection, nthreads):
+    """Return the models of the same run on the visibilities as they are, and with the sources."""
+    samples, grid, options = problem_of_run(one, selection, nthreads)
+    data, models = samples.data, []
     for vis in (data.vis, data.vis + _visibilities(places, flux, data, grid)):
         solved = solve_image(replace(samples, data=replace(data, vis=vis)), grid, options)
         if solved.record.stop_code == STOPPED_BY_USER:  # an unfinished run does not show the resolution
@@ -146,7 +168,7 @@ def _options(parameters, nthreads) -> SolverOptions:
     """Return the solver options in a history; others have their defaults."""
     given = {field.name: _value(parameters[field.name], field.default)
              for field in fields(SolverOptions) if field.name in parameters}
-    return SolverOptions(**given | {"nthreads": nthreads})
+    return SolverOptions(**given | {"nthreads": nthreads, "ndraws": 0, "jackknife": False})
 
 
 def _blocks(text):

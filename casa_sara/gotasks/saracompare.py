@@ -13,7 +13,8 @@ class _saracompare(ShellTask):
     def __call__(
         self, models=None, names=None, outdir=None, vis=None, selectdata=None, field=None, spw=None, timerange=None,
         uvrange=None, antenna=None, scan=None, observation=None, intent=None, datacolumn=None, robust=None, truth=None,
-        regions=None, support=None, threshold=None, inject=None, injectflux=None, frames=None, overwrite=None,
+        regions=None, support=None, threshold=None, inject=None, injectflux=None, features=None, frames=None,
+        overwrite=None,
     ):
         """Run the task, with the values in the shell where no argument is given."""
         given = dict(locals())

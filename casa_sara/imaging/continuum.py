@@ -31,18 +31,26 @@ from casa_sara.imaging.data_quality import (
     thermal_noise,
 )
 from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.error_images import error_images
 from casa_sara.imaging.plane_images import plane_images, point_spread
 from casa_sara.imaging.predict_model import save_model
-from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
-from casa_sara.imaging.time_forecast import Pace, writing_seconds
+from casa_sara.imaging.run_solver import (
+    Watch,
+    checkpoint_of,
+    density_of,
+    expected_iterations,
+    list_islands,
+    solve_image,
+    without_wild,
+)
+from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, ImagingRequest
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
-from casa_sara.reconstruction.reconstruct import Reconstruction, operator_accuracy, schedule_of
+from casa_sara.reconstruction.reconstruct import Reconstruction, operator_accuracy
 from casa_sara.runtime.deadline import Deadline
-from casa_sara.solver.record import UNFINISHED
 
 __all__ = [
     "Result", "Split", "describe", "make_image", "split",
@@ -75,7 +83,7 @@ class Result:
     @property
     def finished(self) -> bool:
         """Whether the run is complete, so that a restart has nothing to continue."""
-        return self.reconstruction is None or self.reconstruction.record.stop_code not in UNFINISHED
+        return self.reconstruction is None or self.reconstruction.finished
 
 
 @dataclass
@@ -126,14 +134,13 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
         part = split(data, output.blocks, comm)
         del data  # the same samples, not yet sorted
         _check(request, plane, part, comm)
-        watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations), checkpoint)
+        watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
         solution = _solve(request, plane, part, watch, ranks)
         images = plane_images(solution.part.data, solution.model, plane.grid, request.weighting, request.options,
                               plane.image_plane, comm)
         doubtful = _look_back(images, plane, solution, comm)
         result = solution.result(images, doubtful, replace(forecast, iteration_s=watch.pace.seconds), comm)
-        comm.once(write_products, output, plane.image_plane, images.pixels, images.sumwt, images.beam,
-                  record and record(result), child)
+        comm.once(_write, request, plane, images, solution.reconstruction, record and record(result), child)
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
@@ -214,7 +221,7 @@ def _solve(request, plane, part, watch, ranks):
     if options.niter == 0:
         return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
     watch.deadline.reserve = _after_iterations(comm.total(data.size), grid, request.output, request.limits,
-                                               watch.deadline.elapsed())
+                                               watch.deadline.elapsed()) + error_seconds(options, grid.shape)
     samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise)
     found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, ranks)
     list_islands(found.record, plane.image_plane, grid.cell_rad, options.significance, comm)
@@ -235,6 +242,15 @@ def _look_back(images, plane, solution, comm):
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
         _caution(data, left_outside(pixels["residual"], plane.support, sigma))
     return doubtful
+
+
+def _write(request, plane, images, reconstruction, record, child):
+    """Write the products, with the errors that the draws give."""
+    draws, jackknife = (reconstruction.draws, reconstruction.jackknife) if reconstruction else (None, None)
+    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
+    if "model.error" in errors:
+        errors["draws"] = draws.arrays()
+    write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child)
 
 
 def split(data, blocks, comm=SERIAL):

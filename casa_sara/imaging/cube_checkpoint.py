@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-import numpy as np
-
 from casa_sara.reconstruction.reconstruct import Reconstruction
-from casa_sara.solver.record import SolverRecord
 
 __all__ = ["CubeCheckpoint"]
 
@@ -99,8 +96,6 @@ class _OfChannel:
 
 def _reconstruction(state):
     """Return a finished solution."""
-    record = SolverRecord()
-    record.set_state(state["record"])
-    record.resumed.pop()  # it was finished, not resumed
-    values = {name: np.array(value) if isinstance(value, np.ndarray) else value for name, value in state.items()}
-    return Reconstruction(**values | dict(record=record))
+    solved = Reconstruction.of(state)
+    solved.record.resumed.pop()  # it was finished, not resumed
+    return solved

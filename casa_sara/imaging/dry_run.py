@@ -122,7 +122,7 @@ def dry_run(selection, grid, options, blocks, limits):
     for line in _time_lines(timing):
         log.info(line)
     seconds = {name: getattr(timing, name) for name in ("reading", "building", "pair", "nnls_iteration", "iteration",
-                                                        "writing", "total")}
+                                                        "drawing", "writing", "total")}
     return found.summary() | {"visibilities": everything, "averages": timing.averages,
                               "iterations": timing.iterations, "seconds": seconds,
                               "iteration_s": timing.iteration}
@@ -135,6 +135,7 @@ def _time_lines(timing):
            "on the data)" + (f", the visibilities averaged to {timing.averages}" if timing.averages else ""))
     rows = {"reading": timing.reading, "building the operator": timing.building,
             "one NNLS iteration": timing.nnls_iteration, "one solver iteration": timing.iteration,
+            **({f"{timing.draws} draws for the errors": timing.drawing} if timing.draws else {}),
             "writing the images": timing.writing}
     for name, seconds in rows.items():
         yield f"  {name:<26}{seconds:10.3f} s"

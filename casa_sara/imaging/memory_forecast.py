@@ -10,6 +10,7 @@ from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
 from casa_sara.operators.sky import further_bytes
 from casa_sara.parallel.partition import ALONE
+from casa_sara.reconstruction.bootstrap import MOST_GROUPS
 
 __all__ = ["Forecast", "Workload", "forecast"]
 
@@ -32,6 +33,8 @@ CHECKPOINT = 16  # the dual and Φz
 PLANE, SUPPORT = 1.25, 0.5  # primary beam and its mask; of a masked model
 NORM, NNLS, SOLVING, WRITING = 8, 4, 9, 10
 MATCHED = 13  # of the matched filters, while the support is found
+DRAW, DRAWN_PART = 1.5, 0.3  # of a draw of the bootstrap, and the part of the image where a confined model may be
+ERRORS = 10  # images of errors, and of the smoothing
 CUBES = 3  # psf, residual and model of each channel
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
@@ -64,6 +67,7 @@ class Workload:
     masked: bool = False
     whole: tuple[int, int] = (0, 0)  # samples and bases of all ranks, where others have some and this one writes
     confined: bool = False
+    draws: int = 0  # of bootstrap and jackknife
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
     averages: bool = False  # visibilities may be averaged
 
@@ -80,6 +84,7 @@ class Workload:
                    masked=grid.masked,
                    whole=(volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
+                   draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2, averages=options.averages)
 
     def memory(self):
@@ -132,6 +137,8 @@ class Workload:
         phases["building the operator"] = with_operator | {"while planning": PLANNING * self.samples}
         phases["NNLS"] = with_solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
         phases["iterating"] = iterating
+        if self.draws:
+            phases["drawing"] = iterating | {"draws": self._drawn() + self._planes(2)}
         if any(self.whole):
             samples, bases = self.whole
             duals_and_weights = 2 * coefficient_bytes(self.shape, bases, self.levels)[0]
@@ -149,7 +156,9 @@ class Workload:
 
     def _writing(self, with_operator):
         parts = with_operator | {"while planning": PLANNING * self.samples,
-                                 "image planes": self._planes(PLANE + WRITING)}
+                                 "image planes": self._planes(PLANE + WRITING + ERRORS * bool(self.draws))}
+        if self.draws:
+            parts |= {"draws": self._drawn()}
         return parts | {"operator of flat spectra": self._operator()} if self.frequencies else parts
 
     def _reporting(self):
@@ -165,6 +174,10 @@ class Workload:
 
     def _planes(self, count):
         return int(4 * (count + SUPPORT * self.masked) * math.prod(self.shape))
+
+    def _drawn(self):
+        """Bytes of the draws."""
+        return self._planes(DRAW * self.draws * (DRAWN_PART if self.confined else 1.0))
 
     def _side(self):
         cell = min(self.cell_rad)

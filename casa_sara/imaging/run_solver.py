@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -20,7 +20,9 @@ from casa_sara.imaging.time_forecast import Pace
 from casa_sara.options import ImageGrid, ImagingRequest, Selection, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, MOST_GROUPS
 from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.draws import FEWEST
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.reconstruct import Control, Reconstruction, reconstruct, schedule_of
 from casa_sara.runtime.deadline import Deadline
@@ -30,19 +32,24 @@ from casa_sara.solver.nnls import NNLS_ITERATIONS
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED, SolverRecord
 from casa_sara.version import __version__
 
-__all__ = ["Watch", "checkpoint_of", "density_of", "list_islands", "solve_image", "without_wild"]
+__all__ = ["Watch", "checkpoint_of", "density_of", "expected_iterations", "list_islands", "solve_image", "without_wild"]
 
 MOST_NAMED = 20  # wild samples that the log names one by one
+DIFFER = 2.0  # times: errors of jackknife and bootstrap that do not agree
 MOST_TOLD = 20  # islands of emission that the log lists
 
 
 @dataclass
 class Watch:
-    """When a solution has to end, how long an iteration takes, and where its state is kept, or was."""
+    """When a solution has to end, how long an iteration takes, where its state is kept, or was, and what is done then.
 
-    deadline: Deadline
-    pace: Pace
-    checkpoint: Checkpoint
+    `then` is called as `Control.then`, with what tells whether to stop before the rest.
+    """
+
+    deadline: Deadline = field(default_factory=Deadline)
+    pace: Pace | None = None
+    checkpoint: Checkpoint | None = None
+    then: Callable[..., None] | None = None
 
 
 def checkpoint_of(request: ImagingRequest) -> Checkpoint:
@@ -118,7 +125,9 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
             preparing()
             return bool(ranks.comm.bcast_numbers([pressed() or bool(watch and watch.deadline.near())])[0])
 
-        control = Control(report, stopped, watch.checkpoint if watch else None, log.info)
+        then = watch and watch.then
+        control = Control(report, stopped, watch.checkpoint if watch else None, log.info, _Drawing(progress, preparing),
+                          then and partial(then, stopped))
         if not (control.checkpoint and control.checkpoint.state is not None):
             progress.prepare("computing the norm of the measurement operator, and the first image by non-negative "
                              f"least squares (NNLS, {NNLS_ITERATIONS} iterations; repeated when outliers are found)")
@@ -128,7 +137,16 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     if record.stop_code == STOPPED_BY_USER and not ranks.comm.bcast(pressed()):
         record.stop_code = TIME_LIMIT
     _log_end(reconstruction, samples.offsets, control.checkpoint, ranks.comm)
+    for draws, what in ((reconstruction.jackknife, "groups of the jackknife"), (reconstruction.draws, "draws")):
+        if draws is not None:
+            _log_draws(draws, what, control.checkpoint)
     return reconstruction
+
+
+def expected_iterations(options: SolverOptions) -> int:
+    """A guess of the iterations of a run: those of the solution and those of the draws."""
+    draws = options.ndraws + options.jackknife * MOST_GROUPS
+    return schedule_of(options).expected_iterations + draws * DRAW_ITERATIONS
 
 
 def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd,
@@ -161,6 +179,33 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")
+
+
+class _Drawing:
+    """The progress of jackknife and bootstrap, after every draw."""
+
+    WORDS = {"draws": "bootstrap: draw", "jackknife": "jackknife: group"}
+
+    def __init__(self, progress, preparing):
+        self._progress, self._preparing = progress, preparing
+
+    def __call__(self, name, draws):
+        """Say how many draws are made; before the first one, too."""
+        self._preparing.over = True
+        self._progress.draw(self.WORDS[name], len(draws), draws.asked)
+
+
+def _log_draws(draws, name, checkpoint):
+    """Write to the log what became of the bootstrap, or of the jackknife."""
+    if not draws.asked:
+        log.info(f"no {name}: the model is empty")
+    elif draws.complete:
+        log.info(f"errors of the model follow from {len(draws)} {name}")
+    else:
+        what = "errors follow from these" if len(draws) >= FEWEST else "no errors follow from so few"
+        stands = checkpoint and checkpoint.stands
+        log.warn(f"{len(draws)} of {draws.asked} {name} were made before the run was stopped: {what}"
+                 + (f"; restart = True makes the others, from '{checkpoint.path}'" if stands else ""))
 
 
 class _Preparing:
@@ -271,16 +316,36 @@ def _log_islands(record, significance, cell_rad):
                  + (f", the {MOST_TOLD} most significant:" if len(islands) > MOST_TOLD else ":" if islands else ""))
     for island in islands[:MOST_TOLD]:
         place = " ".join(_shortened(island[name], digits) for name in ("right_ascension", "declination"))
-        log.info(f"  {place}: {island['flux_jy']:.4g} +- {island['flux_error_jy']:.2g} Jy, S/N {island['snr']:.3g}, "
+        error = island.get("bootstrap_error_jy", island["flux_error_jy"])
+        log.info(f"  {place}: {island['flux_jy']:.4g} +- {error:.2g} Jy, S/N {island['snr']:.3g}, "
                  f"FWHM {island['fwhm_arcsec']:.3g} arcsec")
     if faint:
         log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")
+    _compare_errors(islands)
     worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"],
                 default=None)
     if worst and worst["snr"] > STRUCTURE:
         log.warn(f"the residual image is not consistent with noise: smoothed to {worst['beams']:g} beams it reaches "
                  f"{worst['snr']:.3g} sigma. Possible causes are calibration errors, emission outside the image, or "
                  "emission that the model cannot represent")
+
+
+def _compare_errors(islands):
+    """Say how the errors of the jackknife compare with those of the bootstrap, where there are both."""
+    ratios = [island["jackknife_error_jy"] / island["bootstrap_error_jy"] for island in islands
+              if "jackknife_error_jy" in island and island.get("bootstrap_error_jy", 0) > 0]
+    if not ratios:
+        return
+    middle = float(np.median(ratios))
+    line = (f"errors of the fluxes of islands by the jackknife over snapshots are {middle:.2g} times those by the "
+            f"bootstrap (median of {len(ratios)})")
+    if middle > DIFFER:
+        log.warn(f"{line}: more than the noise explains, as of calibration errors that differ between snapshots; "
+                 "believe the larger ones")
+    elif middle < 1 / DIFFER:
+        log.warn(f"{line}: less than the noise alone should give")
+    else:
+        log.info(line)
 
 
 def _shortened(angle, digits):

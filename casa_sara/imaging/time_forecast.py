@@ -10,16 +10,18 @@ import numpy as np
 
 from casa_sara.data.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
+from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, DRAW_REWEIGHTINGS, MOST_GROUPS
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
 from casa_sara.reconstruction.problem import Problem, Samples
 from casa_sara.reconstruction.reconstruct import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.nnls import NNLS_ITERATIONS, NNLSFit, nnls
 
-__all__ = ["Pace", "Timing", "measure", "writing_seconds"]
+__all__ = ["Pace", "Timing", "error_seconds", "measure", "writing_seconds"]
 
 STARTING = 5.0  # libraries, compiled code, image plane
 WRITE_BASE, WRITE_SAMPLE, WRITE_PIXEL = 1.0, 6e-7, 2.5e-7
+SMOOTH_PIXEL = 3e-7
 MARGIN = 2.0  # on these: disks differ
 NORM_PAIRS = 60  # Φ and Φ† for ‖Φ‖, in all
 REWEIGHTING = 4  # iterations' time of one re-weighting
@@ -43,6 +45,8 @@ class Timing:
         Seconds in which averages are made anew, at a re-weighting.
     averages : int
         To which the visibilities are averaged, 0 where they are not.
+    draws : int
+        Of bootstrap and jackknife.
     """
 
     reading: float
@@ -57,6 +61,12 @@ class Timing:
     nnls_iterations: int = NNLS_ITERATIONS
     renewal: float = 0.0
     averages: int = 0
+    draws: int = 0
+
+    @property
+    def drawing(self) -> float:
+        """Seconds of the draws."""
+        return self.draws * (DRAW_ITERATIONS + REWEIGHTING * DRAW_REWEIGHTINGS) * self.iteration
 
     @property
     def total(self) -> float:
@@ -66,7 +76,7 @@ class Timing:
         reweighting = REWEIGHTING * self.iteration + self.renewal
         solving = self.iterations * self.iteration + self.reweightings * reweighting
         first = NORM_PAIRS * self.pair + self.nnls_iterations * self.nnls_iteration
-        return STARTING + self.reading + self.channels * (self.building + first + solving + self.writing)
+        return STARTING + self.reading + self.channels * (self.building + first + solving + self.drawing + self.writing)
 
 
 def measure(data, offsets, grid, options, reading):
@@ -89,7 +99,7 @@ def measure(data, offsets, grid, options, reading):
     -------
     Timing
     """
-    writing = writing_seconds(data.size, grid.shape)
+    writing = writing_seconds(data.size, grid.shape) + error_seconds(options, grid.shape)
     if not options.niter:
         return Timing(reading, 0.0, 0.0, 0.0, 0.0, writing, 0, 0)
     start = time.perf_counter()
@@ -112,7 +122,7 @@ def measure(data, offsets, grid, options, reading):
     of_blocks = schedule.nnls_iterations if options.method == PAPER else 0
     return Timing(reading, building, pair, first, _seconds(ppd.step), writing, schedule.expected_iterations,
                   schedule.expected_reweightings, nnls_iterations=NNLS_ITERATIONS + of_blocks, renewal=renewal,
-                  averages=ppd.vis.size if ppd.averaged else 0)
+                  averages=ppd.vis.size if ppd.averaged else 0, draws=_draws(options))
 
 
 def _seconds(call, repeats=3):
@@ -129,6 +139,17 @@ def _seconds(call, repeats=3):
 def writing_seconds(samples, shape):
     """Seconds that making and writing the images takes, with a margin."""
     return MARGIN * (WRITE_BASE + WRITE_SAMPLE * samples + WRITE_PIXEL * math.prod(shape))
+
+
+def _draws(options):
+    """Draws of bootstrap and jackknife, which has as many groups as there can be."""
+    return options.ndraws + options.jackknife * MOST_GROUPS
+
+
+def error_seconds(options, shape):
+    """Seconds that making and writing the images of errors from draws takes, with a margin."""
+    draws = _draws(options)
+    return MARGIN * (draws * SMOOTH_PIXEL + 2 * bool(draws) * WRITE_PIXEL) * math.prod(shape)
 
 
 class Pace:

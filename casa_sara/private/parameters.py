@@ -24,6 +24,7 @@ SARACOMPARE = (
     Parameter('threshold', ('double',), 0.001, 'The support is what exceeds this fraction of the peak', minimum=0.0, maximum=1.0),
     Parameter('inject', ('string', 'stringVec'), [], 'Where to inject point sources, to measure the resolution; []: nowhere'),
     Parameter('injectflux', ('double',), 0.0, 'Flux of each injected source in Jy; 0: 100 times the noise per beam', minimum=0.0),
+    Parameter('features', ('string', 'stringVec'), [], 'Regions with structures of which to test whether they are real; []: none'),
     Parameter('frames', ('string', 'stringVec'), [], 'Images of an animation in the report, in the order to show them'),
     Parameter('overwrite', ('bool',), False, 'Write into a folder that holds files'),
 )
@@ -90,6 +91,8 @@ TSARA = (
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
     Parameter('significance', ('double',), 5.0, 'Signal-to-noise ratio above which emission enters the model; 0 for no limit', minimum=0.0),
+    Parameter('ndraws', ('int',), 0, 'Draws of the bootstrap that gives the errors of the model; 0: none, 20 are usual', minimum=0.0),
+    Parameter('jackknife', ('bool',), False, 'Find errors from solutions that leave out one group of snapshots each'),
     Parameter('blocks', ('int', 'string', 'stringVec'), 0, 'Data blocks, each with its own noise level: 0 for one per snapshot, a number, or selections of data'),
     Parameter('nthreads', ('int',), 0, 'Number of threads; 0: all available cores', minimum=0.0, maximum=1024.0),
     Parameter('dryrun', ('bool',), False, 'Only predict the memory and time of the run'),

@@ -175,6 +175,10 @@ def _solution(result, options, full):
         sara["averaging"] = dict(solved.averaging)
         sara["islands"] = [dict(island) for island in record.islands]
         sara["residual_snr"] = [dict(peak) for peak in record.residual_snr]
+        if solved.draws is not None:
+            sara["draws"] = {"asked": options.ndraws, "made": len(solved.draws)}
+        if solved.jackknife is not None:
+            sara["jackknife"] = {"groups": solved.jackknife.asked, "made": len(solved.jackknife)}
         sara["reweightings"] = [dict(update) for update in record.reweightings]
         sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds} for iteration, bounds in record.bounds]
         if full:

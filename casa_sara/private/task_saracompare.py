@@ -18,8 +18,9 @@ from casa_sara.version import __version__
 
 __all__ = ["saracompare"]
 
-LISTS = ("models", "names", "regions", "frames", "inject")
-OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust", "inject", "injectflux")  # what has no effect without vis
+LISTS = ("models", "names", "regions", "frames", "inject", "features")
+# what has no effect without vis
+OF_VIS = (*Selection.PARAMETERS, "datacolumn", "robust", "inject", "injectflux", "features")
 
 
 def saracompare(**parameters: Any) -> dict[str, Any]:
@@ -27,14 +28,14 @@ def saracompare(**parameters: Any) -> dict[str, Any]:
     log.info(f"casa_sara {__version__}")
     selection = _selection(parameters)
     folder = _folder(parameters["outdir"], parameters["overwrite"])
-    models, names, regions, frames, inject = (_words(parameters[name]) for name in LISTS)
+    models, names, regions, frames, inject, features = (_words(parameters[name]) for name in LISTS)
     if frames and not folder:
         raise ValueError(f"frames = {list(frames)} has no effect without outdir: give outdir, the folder of the report")
     if parameters["injectflux"] and not inject:
         raise ValueError(f"injectflux = {parameters['injectflux']!r} has no effect without inject: give inject, the "
                          "places of the sources")
     request = Comparing(models, names, parameters["truth"], regions, parameters["support"], parameters["threshold"],
-                        parameters["robust"], frames, inject, parameters["injectflux"], available_cores())
+                        parameters["robust"], frames, inject, parameters["injectflux"], features, available_cores())
     comparison = compare_images(request, selection)
     if folder:
         _report(comparison, folder)

@@ -59,6 +59,7 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
                           tuple(parameters["uvtaper"]))
     options = _solver_options(parameters, comm)
     _refuse_for_cubes(parameters)
+    _check_errors(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"] and comm.size > 1:
         raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is "
@@ -79,7 +80,8 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
 
 def _prepare(parameters, selection, grid, stack):
     """Take the imagename for as long as the stack lasts, and return the options of the output."""
-    check_imagename(parameters["imagename"], grid.shape, 2 * parameters["pbcor"] + grid.masked)
+    more = 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"]) + parameters["jackknife"]
+    check_imagename(parameters["imagename"], grid.shape, more)
     stack.enter_context(one_run_of(parameters["imagename"]))
     recover_products(parameters["imagename"])
     output = _output(parameters)
@@ -176,6 +178,20 @@ def _refuse_for_cubes(parameters):
                          "False")
 
 
+def _check_errors(parameters):
+    """Raise where errors are asked for that cannot be found."""
+    for name, right in (("ndraws", 0), ("jackknife", False)):
+        value = parameters[name]
+        if value and parameters["specmode"] == "cube":
+            raise ValueError(f"{name} = {value} with specmode = 'cube': errors are found for continuum images only; "
+                             f"should be {right}")
+        if value and parameters["niter"] == 0:
+            raise ValueError(f"{name} = {value} with niter = 0: errors are those of a model that was solved; should be "
+                             f"{right}")
+    if parameters["ndraws"] == 1:
+        raise ValueError("ndraws = 1: an error takes two draws or more; should be 0, or at least 2 (20 are usual)")
+
+
 def _check_stokes(parameters):
     """Raise on parameters that are not possible with Stokes Q, U and V."""
     stokes = parameters["stokes"]
@@ -196,6 +212,8 @@ def _check_method(parameters):
         return
     for name, right, reason in (("regscale", 1.0, "its prior has no weight that depends on the noise"),
                                 ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
+                                ("ndraws", 0, "its errors are not known from draws"),
+                                ("jackknife", False, "its errors are not known from draws"),
                                 ("parallel", False, "it runs in one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, "

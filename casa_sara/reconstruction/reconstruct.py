@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -16,21 +16,26 @@ from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.bootstrap import Bootstrap, Jackknife, jackknife_groups
 from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.draws import FEWEST, Draws
 from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
 from casa_sara.reconstruction.problem import DYNAMIC_RANGE, Findings, Problem, Samples, averaging_cell, first_image
 from casa_sara.reconstruction.state_file import digest
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, run_paper_algorithm_2
+from casa_sara.solver.islands import add_flux_errors
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds, chi_square_bounds
-from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
+from casa_sara.solver.record import CONVERGED, DIVERGED, NOISE_ONLY, UNFINISHED, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, run_algorithm_2
+from casa_sara.solver.significance import SignificantSupport
 
 __all__ = ["Control", "Reconstruction", "check_l2bound", "operator_accuracy", "reconstruct", "schedule_of"]
 
 STEP_BALANCE = 0.15  # κ in units of the mean brightness Σx²/Σ|x| of the first model
 NOISE_ONLY_SNR = 5.0
 NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
+ERRORS_OF_ISLANDS = dict(draws="bootstrap_error_jy", jackknife="jackknife_error_jy")
 
 
 @dataclass(frozen=True)
@@ -50,12 +55,19 @@ class Control:
         it.
     tell : callable
         Takes a line for the log.
+    drawn : callable
+        Called with 'jackknife' and its `Draws`, then with 'draws' and those of the bootstrap: before the first one of
+        each, and after every one.
+    then : callable, optional
+        Called at the end with the iteration, its bounds and its record, all as the solution has left them.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
     stopped: Callable[[], bool] = lambda: False
     checkpoint: Checkpoint | None = None
     tell: Callable[[str], None] = lambda line: None
+    drawn: Callable[[str, Draws], None] = lambda name, draws: None
+    then: Callable[[AdaptivePPD, Any, SolverRecord], None] | None = None
 
 
 @dataclass
@@ -85,6 +97,8 @@ class Reconstruction:
         `averages` to which these samples were averaged, `cell_wavelengths` (u, v) of the largest uv cells, `halvings`
         of each block's, and the `largest_error` of the averages of the first image in units of their noise; empty where
         they were not.
+    draws, jackknife : Draws or None
+        Of the bootstrap and of the jackknife, where asked for and the solution has come to an end.
     """
 
     model: np.ndarray
@@ -98,6 +112,33 @@ class Reconstruction:
     kept: np.ndarray
     wild: list[dict]
     averaging: dict
+    draws: Draws | None = None
+    jackknife: Draws | None = None
+
+    @classmethod
+    def of(cls, state: dict[str, Any]) -> Reconstruction:
+        """Make it of its attributes as a checkpoint has them.
+
+        Parameters
+        ----------
+        state : dict
+            Attributes by name, the record as of :meth:`SolverRecord.state`.
+
+        Returns
+        -------
+        Reconstruction
+        """
+        record = SolverRecord()
+        record.set_state(state["record"])
+        values: dict[str, Any] = {name: np.array(value) if isinstance(value, np.ndarray) else value
+                                  for name, value in state.items()}
+        return cls(**values | dict(record=record))
+
+    @property
+    def finished(self) -> bool:
+        """Whether a restart would have nothing to continue."""
+        drawn = [draws for draws in (self.jackknife, self.draws) if draws is not None]
+        return self.record.stop_code not in UNFINISHED and all(draws.complete for draws in drawn)
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -129,12 +170,12 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     Raises
     ------
     ValueError
-        Noise levels that are neither one for all blocks nor one for each.
+        Noise levels that are neither one for all blocks nor one for each; too few blocks for a jackknife.
     CheckpointError
         The state that was read is not one of these data.
     """
     comm, checkpoint = ranks.comm, control.checkpoint
-    check_l2bound(options, len(samples.offsets) - 1)
+    _check_blocks(options, len(samples.offsets) - 1)
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(comm.mean(samples.data.weight, dtype=float) ** -0.5)
     problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support, comm=comm,
@@ -150,8 +191,31 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
             control = replace(control, checkpoint=None)
     averaging = _averaging(solution, averaging_cell(grid))
     control.tell(_averaging_words(solution.ppd, averaging, options, averaging_cell(grid)))
+    if solution.result is None:
+        _solve(solution, samples, averaging, options, control, layout, ranks)
+    for name, resampling in solution.resamplings.items():
+        if not _draw(solution, name, resampling, control, layout, ranks):
+            break
+    return solution.result
+
+
+def _solve(solution, samples, averaging, options, control, layout, ranks):
+    """Run the solution to its end, and make ready for what follows it."""
     record = _iterate(solution, options, control, layout, ranks)
-    return _result(solution, record, samples, averaging, comm)
+    _begin_draws(solution, record, options)
+    goes_on = bool(solution.resamplings or control.then)
+    solution.result = _result(solution, record, samples, averaging, ranks.comm, goes_on)
+    if goes_on:  # with averages that are exact for its model
+        solution.ppd.renew_averages(solution.ppd.model)
+    if control.then:
+        control.then(solution.ppd, solution.bounds, record)
+
+
+def _check_blocks(options, blocks):
+    """Raise where options and number of blocks do not go together."""
+    check_l2bound(options, blocks)
+    if options.jackknife:
+        jackknife_groups(blocks)
 
 
 def _averaging(solution, sides):
@@ -200,6 +264,37 @@ def _iterate(solution, options, control, layout, ranks):
     return run(solution.ppd, solution.bounds, schedule, control.progress, control.stopped, keep, solution.stage)
 
 
+def _begin_draws(solution, record, options):
+    """Make ready for the draws, once the solution has come to an end; an empty model has no errors to draw."""
+    ppd, blocks = solution.ppd, len(solution.bounds.l2_bounds)
+    if record.stop_code in (*UNFINISHED, DIVERGED):
+        return
+    scale = record.reweightings[-1]["scale"] if record.reweightings else 0.0
+    for name, kind, asked in (("jackknife", Jackknife, jackknife_groups(blocks) if options.jackknife else 0),
+                              ("draws", Bootstrap, options.ndraws)):
+        if asked:
+            draws = Draws(ppd.model.shape, asked if ppd.model.any() else 0)
+            solution.resamplings[name] = kind(ppd, solution.bounds, _support(options), scale, ppd.model.copy(),
+                                              ppd.threshold, draws)
+
+
+def _support(options):
+    """Return the support of a solution that has found one, None where nothing confines the model."""
+    confined = options.significance > 0 and options.nreweights > 0
+    return SignificantSupport(options.significance, begun=True) if confined else None
+
+
+def _draw(solution, name, resampling, control, layout, ranks):
+    """Make the draws of one kind, keeping the state, and add the errors of islands; return whether all are made."""
+    draws = resampling.draws
+    drawn = partial(control.drawn, name)
+    drawn(draws)
+    resampling.run(control.stopped, drawn, partial(_keep, solution, control.checkpoint, layout, ranks, None))
+    if len(draws) >= FEWEST:
+        add_flux_errors(solution.result.record.islands, resampling.model, draws.flux_errors, ERRORS_OF_ISLANDS[name])
+    return draws.complete
+
+
 def _keep(solution, checkpoint, layout, ranks, stage, now):
     """Write the checkpoint if there is one and its time has come, or `now`."""
     if checkpoint is None:
@@ -212,18 +307,20 @@ def _keep(solution, checkpoint, layout, ranks, stage, now):
         comm.once(checkpoint.keep, lambda: state, iteration, now=True)
 
 
-def _result(solution, record, samples, averaging, comm):
-    """Return what was found, in Jy."""
+def _result(solution, record, samples, averaging, comm, goes_on):
+    """Return what was found, in Jy; the iteration keeps its model where it `goes_on`."""
     found, ppd, bounds, unit_jy = solution.found, solution.ppd, solution.bounds, solution.ppd.unit_jy
-    model = comm.own(ppd.model)
+    resamplings = solution.resamplings
+    model = ppd.model.copy() if goes_on else comm.own(ppd.model)
     if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
     return Reconstruction(
-        model, bounds.l2_bounds, ppd.residual_norms, found.nnls_norms, record,
+        model, bounds.l2_bounds, ppd.residual_norms.copy(), found.nnls_norms, record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
-        wild=found.wild, averaging=averaging)
+        wild=found.wild, averaging=averaging,
+        **{name: resampling.draws for name, resampling in resamplings.items()})
 
 
 @dataclass
@@ -234,6 +331,8 @@ class _Solution:
     ppd: AdaptivePPD
     bounds: AdaptiveBounds | GivenBounds | PaperBounds
     stage: Stage | PaperStage | None = None
+    result: Reconstruction | None = None
+    resamplings: dict[str, Bootstrap] = field(default_factory=dict)
 
     @classmethod
     def of(cls, problem, found, options, ranks):
@@ -261,7 +360,11 @@ class _Solution:
         ppd, kept = self.ppd.state(), Layout(self.ppd.offsets, ranks.comm)
         ppd |= {name: kept.gather(ppd[name]) for name in SAMPLE_ARRAYS}
         ppd |= {name: ranks.gather_bases(ppd[name]) for name in BASIS_ARRAYS}
-        return dict(found=found, ppd=ppd, bounds=self.bounds.state(), stage=stage.state())
+        state = dict(found=found, ppd=ppd, bounds=self.bounds.state())
+        if self.result is None:
+            return state | dict(stage=stage.state())
+        result = vars(self.result) | dict(record=self.result.record.state(), kept=None, draws=None, jackknife=None)
+        return state | dict(result=result, resamplings={name: one.state() for name, one in self.resamplings.items()})
 
 
 def _begin(samples, problem_of, options, startmodel, stopped, ranks):
@@ -301,9 +404,25 @@ def _resume(samples, layout, problem_of, options, checkpoint, ranks):
         ppd |= {name: ranks.scatter_bases(ppd[name]) for name in BASIS_ARRAYS}
         solution.ppd.set_state(ppd)
         solution.bounds.set_state(state["bounds"])
-        solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
-        solution.ppd.renew_averages(solution.stage.previous)
+        if "resamplings" in state:
+            kept = np.delete(samples.kept, found.left_out)
+            _resume_draws(solution, options, state["result"] | dict(kept=kept), state["resamplings"])
+        else:
+            solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
+            solution.ppd.renew_averages(solution.stage.previous)
     return solution
+
+
+def _resume_draws(solution, options, result, states):
+    """Take over the result, and the draws so far."""
+    solution.result = Reconstruction.of(result)
+    for name, state in states.items():
+        draws = Draws.of(state["draws"])
+        setattr(solution.result, name, draws)
+        kind, model = Jackknife if name == "jackknife" else Bootstrap, np.array(state["model"])
+        solution.resamplings[name] = kind(solution.ppd, solution.bounds, _support(options), state["scale"], model,
+                                          state["threshold"], draws, state["done"])
+        solution.ppd.renew_averages(model)
 
 
 def check_l2bound(options: SolverOptions, blocks: int) -> None:

@@ -23,7 +23,7 @@ from casa_sara.runtime.atomic import new_file
 __all__ = ["CheckpointError", "digest", "read", "write"]
 
 MAGIC = b"casa_sara checkpoint 1\n"  # the number is that of the format
-TYPES = ("<f4", "<f8", "<c8", "<c16", "<i4", "<i8", "|b1")
+TYPES = ("<f2", "<f4", "<f8", "<c8", "<c16", "<i4", "<i8", "|b1")
 _DIGEST = hashlib.sha256().digest_size
 
 

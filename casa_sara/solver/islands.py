@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import find_objects, label
+from scipy.ndimage import distance_transform_edt, find_objects, label
 
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.convolution import convolve_valid
@@ -14,7 +15,7 @@ from casa_sara.solver.matched_filter import BEAMS, SIGMA_TO_FWHM
 from casa_sara.solver.record import SolverRecord
 from casa_sara.solver.significance import gradient_image, matched_filter
 
-__all__ = ["STRUCTURE", "islands_of", "look_at"]
+__all__ = ["STRUCTURE", "add_flux_errors", "islands_of", "look_at"]
 
 STRUCTURE = 5.0  # standard deviations over a beam or more, from which on a residual is not noise
 
@@ -65,12 +66,12 @@ def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list
     Returns
     -------
     list of dict
-        `x`, `y` (pixel of the centroid), `flux_jy`, `flux_error_jy`, `snr` (‖Σ^{−½}Φx_i‖, the square root of the χ²
-        that the island explains; the error of the flux is that of its strength, its shape being known), `pixels` (area)
-        and `fwhm_pixels` (of a circular Gaussian of the same second moments; 0 for a point between pixels, whose
-        pixels have none).
+        `x`, `y` (pixel of the centroid), `x_peak`, `y_peak` (of the brightest pixel), `flux_jy`, `flux_error_jy`, `snr`
+        (‖Σ^{−½}Φx_i‖, the square root of the χ² that the island explains; the error of the flux is that of its
+        strength, its shape being known), `pixels` (area) and `fwhm_pixels` (of a circular Gaussian of the same second
+        moments; 0 for a point between pixels, whose pixels have none).
     """
-    labels, number = label(model != 0, np.ones((3, 3), int))
+    labels, number = _labelled(model)
     found = []
     for index, box in zip(range(1, number + 1), find_objects(labels)):
         part = np.where(labels[box] == index, model[box], 0).astype(float)
@@ -82,10 +83,42 @@ def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list
         spread = (size.sum(axis=1) @ (x - centre[0]) ** 2 + size.sum(axis=0) @ (y - centre[1]) ** 2) / total
         snr = float(np.sqrt(max(np.vdot(part, _response(part, psf)), 0.0)))
         flux = float(part.sum() * unit_jy)
-        found.append(dict(x=centre[0], y=centre[1], flux_jy=flux, flux_error_jy=abs(flux) / max(snr, 1e-30), snr=snr,
-                          pixels=int(np.count_nonzero(part)),
+        peak = np.unravel_index(np.abs(part).argmax(), part.shape)
+        found.append(dict(x=centre[0], y=centre[1], x_peak=int(x[peak[0]]), y_peak=int(y[peak[1]]), flux_jy=flux,
+                          flux_error_jy=abs(flux) / max(snr, 1e-30), snr=snr, pixels=int(np.count_nonzero(part)),
                           fwhm_pixels=float(SIGMA_TO_FWHM * np.sqrt(max(0.5 * spread, 0.0)))))
     return sorted(found, key=lambda island: -island["snr"])
+
+
+def _labelled(model):
+    """Return the number of the island of each pixel, 0 where there is none, and how many there are."""
+    return label(model != 0, np.ones((3, 3), int))
+
+
+def add_flux_errors(islands: list[dict[str, Any]], model: np.ndarray, flux_errors: Callable[[np.ndarray], np.ndarray],
+                    name: str) -> None:
+    """Give the islands of a model the errors of their fluxes that draws find.
+
+    The flux of a draw belongs to the nearest island, wherever in its surroundings the draw has it.
+
+    Parameters
+    ----------
+    islands : list of dict
+        Of :func:`islands_of`.
+    model : real (nx, ny)
+        x̂.
+    flux_errors : callable
+        Takes the number of the region of each pixel, int (nx, ny), and returns the error of each region's flux in Jy.
+    name : str
+        Of the entry.
+    """
+    if not islands:
+        return
+    labels, _ = _labelled(model)
+    nearest = distance_transform_edt(labels == 0, return_distances=False, return_indices=True)
+    errors = flux_errors(labels[tuple(nearest)])
+    for island in islands:
+        island[name] = float(errors[labels[island["x_peak"], island["y_peak"]] - 1])
 
 
 def _response(part, psf):

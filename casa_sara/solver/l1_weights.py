@@ -6,12 +6,12 @@ import numpy as np
 
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
+from casa_sara.solver.noise_draws import draw_noise
 
 __all__ = ["band_noise", "first_weights", "reweight"]
 
 SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at the end
 SLAB = 64  # lines squared at a time
-DRAWN = 1 << 20  # random numbers at a time
 APPROXIMATIONS = 0.12  # of the prior on them within a support: they hold the flux, and little of the noise
 POINTS = 0.25  # of the prior, on sources that one point explains
 
@@ -42,28 +42,12 @@ def band_noise(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds,
     """
     rng = np.random.default_rng(seed)
     noise = ppd.scratch_vis
-    for j, (a, b) in enumerate(ppd.blocks() if ppd.vis.size else ()):
-        here = ppd.begins[j], b - a, ppd.block_sizes[j]
-        noise[a:b] = _normal(rng, *here) + 1j * _normal(rng, *here)
-        noise[a:b] *= np.sqrt(bounds.noise_weights[j])
+    draw_noise(ppd, rng, np.sqrt(bounds.noise_weights), noise)
     image = ppd.adjoint(noise, ppd.scratch_image)
     image /= image.dtype.type(bounds.total_weight)
     coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
     bands = [_rms(coefs[band.slice]) for band in ppd.dictionary.bands()]
     return np.maximum(bands, 1e-30), _rms(image) / np.sqrt(ppd.dictionary.n_bases)
-
-
-def _normal(rng, begin, count, size):
-    """Return `count` of `size` standard normal numbers, from number `begin` on; all are drawn, as by one rank."""
-    if count == size:
-        return rng.standard_normal(size)
-    chosen = np.empty(count)
-    for start in range(0, size, DRAWN):
-        drawn = rng.standard_normal(min(DRAWN, size - start))
-        first, end = (int(np.clip(edge - start, 0, drawn.size)) for edge in (begin, begin + count))
-        if first < end:
-            chosen[start + first - begin : start + end - begin] = drawn[first:end]
-    return chosen
 
 
 def _rms(values):

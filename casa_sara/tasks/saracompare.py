@@ -138,6 +138,20 @@ class _saracompare:
     injectflux : float, default 0.0
         The noise is the standard deviation of the residual image with natural weights.
 
+    features : str or list of str, default []
+        Regions as in regions. The run of every image of tsara is repeated with the parameters in its
+        history, and then solved without emission in the region and with emission free there,
+        elsewhere where the model has some. How much chi-square rises without it (the sum of the
+        squared residuals over the noise found) is held against the same for 20 draws of the model
+        without it and new noise, in which nothing is there: 'p_value' is the probability that noise
+        alone gives as much, from the scaled chi-square distribution of the draws, and 'sigma' the
+        Gaussian with that tail; far beyond the draws both are extrapolated. 'rank_p_value' is what
+        the draws alone tell, at least 1/21. Needs vis; each region takes about ten times as long as
+        the run. A region should hold the whole structure, and have been chosen before looking:
+        otherwise multiply the p-value by the number of places that could have been chosen. Calibration
+        errors count as far as they raise the noise found.
+        Example: features=['companion = 19h59m28.32s +40d44m01.9s 0.15arcsec']
+
     frames : str or list of str, default []
         Two or more images of the field with different pixel sizes, in the order to show them, named
         as in models and with their centre. The animation shows the field and every region of
@@ -153,12 +167,13 @@ class _saracompare:
     -------
     dict
       'products' holds for each name flux_jy, peak_jy_per_pixel, negative_jy, mdr (dynamic range of
-      the model), regions (flux_jy, error_jy, model_flux_jy of each) and, for natural and briggs
-      weights, sigma, peak, dr (peak of the restored image over the standard deviation of the
+      the model), regions (flux_jy, error_jy, model_flux_jy of each, and model_error_jy where tsara
+      had ndraws) and, for natural and briggs weights, sigma, peak, dr (peak of the restored image over the standard deviation of the
       residual), max_abs, skewness, kurtosis, whiteness and chi_square of each snapshot; with a
       truth also snr, log_snr, ssim with its range, and snr_at_scale (in dB, by the beam in arcsec),
       and fwhm_recovered_arcsec where the truth has a point source; with inject, 'injected' of each
-      source: injected_jy, flux_jy, offset_arcsec, fwhm_arcsec and fwhm_in_beams. 'similarity' holds for each
+      source: injected_jy, flux_jy, offset_arcsec, fwhm_arcsec and fwhm_in_beams; with features,
+      'features' of each: flux_jy, delta_chi_square, drawn, p_value, rank_p_value and sigma. 'similarity' holds for each
       weighting S in dB of each pair 'one|other' of models smoothed with the beam. What could not
       be measured is left out.
 
@@ -184,7 +199,7 @@ class _saracompare:
     def __call__(
         self, models='', names=[], outdir='', vis=[], selectdata=True, field='', spw='', timerange='', uvrange='',
         antenna='', scan='', observation='', intent='', datacolumn='corrected', robust=-1.0, truth='', regions=[],
-        support='', threshold=0.001, inject=[], injectflux=0.0, frames=[], overwrite=False,
+        support='', threshold=0.001, inject=[], injectflux=0.0, features=[], frames=[], overwrite=False,
     ):
         """Run the task."""
         values = dict(locals())

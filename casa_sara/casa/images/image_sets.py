@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from casa_sara.casa.images.products import RECORD
+from casa_sara.casa.images.products import DRAWS, RECORD
 from casa_sara.casa.images.record import read_record
 from casa_sara.casa.images.sky_image import SkyImage, read_header, read_sky_image
 
@@ -37,6 +37,8 @@ class ImageSet:
         Task parameters in the history of the images.
     record : dict
         What tsara recorded, else empty.
+    draws : str
+        File of the draws of a bootstrap, '' where there is none.
     """
 
     name: str
@@ -45,6 +47,7 @@ class ImageSet:
     beam: tuple[float, float, float] | None = None
     parameters: dict[str, str] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
+    draws: str = ""
 
     def called(self, name):
         """Return the same with another name."""
@@ -93,7 +96,8 @@ def read_image_set(given, name="", with_residual=True):
         parameters |= of_image
     record = root + RECORD
     return ImageSet(name or os.path.basename(root), model, residual, next(filter(None, beams), None),
-                    parameters | model.parameters, read_record(record) if os.path.isfile(record) else {})
+                    parameters | model.parameters, read_record(record) if os.path.isfile(record) else {},
+                    root + DRAWS if os.path.isfile(root + DRAWS) else "")
 
 
 def read_frames(names, plane):

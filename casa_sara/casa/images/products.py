@@ -1,5 +1,5 @@
 """What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
-(.mask .image.pbcor .model.pbcor), and the record .sara.json.
+(.mask .image.pbcor .model.pbcor .model.error .image.error .image.jackknife .draws.npz), and the record .sara.json.
 
 They appear together (:mod:`casa_sara.runtime.atomic`), and replace those of an older run of this name together.
 """
@@ -17,7 +17,7 @@ import numpy as np
 
 from casa_sara.casa.images.image_files import write_image
 from casa_sara.casa.images.image_plane import ImagePlane
-from casa_sara.casa.images.restore import restore, write_corrected
+from casa_sara.casa.images.restore import restore, restored_beam, write_corrected
 from casa_sara.casa.runtime.child_process import ChildError, in_child
 from casa_sara.casa.runtime.tools import opened
 from casa_sara.options import Output
@@ -26,19 +26,20 @@ from casa_sara.runtime.atomic import new_files, recover_files, sync
 from casa_sara.version import __version__
 
 __all__ = [
-    "CHECKPOINT", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
+    "CHECKPOINT", "DRAWS", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
     "recover_products", "remove_products", "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor")
+ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor", ".model.error", ".image.error", ".image.jackknife")
+DRAWS = ".draws.npz"  # of a bootstrap
 CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
 
 
 def existing_products(imagename):
     """Return the paths of the existing products of this name."""
-    return [imagename + suffix for suffix in (*PRODUCTS, *ON_REQUEST, RECORD, REPORT)
+    return [imagename + suffix for suffix in (*PRODUCTS, *ON_REQUEST, DRAWS, RECORD, REPORT)
             if os.path.lexists(imagename + suffix)]
 
 
@@ -109,7 +110,8 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
         The image plane: coordinates, primary beam, mask.
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
-        residual in Jy/beam) and 'model' in Jy/pixel; 'mask' where there is one.
+        residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'model.error', 'image.error' and
+        'image.jackknife' where there are; 'draws' is a dict of arrays, kept as `DRAWS`.
     sumwt : float, or one for each channel
         Sum of the imaging weights.
     beam : dict
@@ -124,7 +126,8 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     OSError
         The images could not be written, as on a full disk; everything is as it was before.
     """
-    more = 2 * output.pbcor + ("mask" in images)
+    images, draws = {name: image for name, image in images.items() if name != "draws"}, images.get("draws")
+    more = 2 * output.pbcor + sum(name not in ("psf", "residual", "model") for name in images)
     check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
@@ -132,6 +135,8 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
                      sumwt=np.asarray(sumwt, np.float32), beam=beam, output=asdict(output))
             if record is not None:
                 jsonfile.save(root + RECORD, record)
+            if draws is not None:
+                np.savez_compressed(root + DRAWS, **draws)
             sync(os.path.dirname(root))
         except (ChildError, OSError) as error:
             raise _not_written(output.imagename, _bytes_needed(plane.pb.shape, more), os.path.dirname(root),
@@ -152,6 +157,11 @@ def write_images(root, plane, images, sumwt, beam, output):
         write_image(root + ".mask", images["mask"], plane)
     if output.pbcor:
         write_corrected(root, plane, images["model"])
+    if "model.error" in images:
+        write_image(root + ".model.error", images["model.error"], plane, unit="Jy/pixel")
+    for name in {"image.error", "image.jackknife"} & images.keys():
+        restored = restored_beam(list(output.restoringbeam), beam)
+        write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored, masked=plane.masks_all)
     for path in existing_products(root):
         with opened("image", path) as ia:
             ia.sethistory(origin="tsara", history=list(output.history))

@@ -12,7 +12,7 @@ from casa_sara.casa.images.image_plane import read_pixels
 from casa_sara.casa.runtime.quantities import radians
 from casa_sara.casa.runtime.tools import made, opened, scratch_folder
 
-__all__ = ["fit_beam", "restore", "restoring_beam_words", "write_corrected"]
+__all__ = ["fit_beam", "restore", "restored_beam", "restoring_beam_words", "write_corrected"]
 
 PSF_CUTOFF = 0.35  # of tclean: the Gaussian is fitted to the PSF above this fraction of its peak
 
@@ -82,6 +82,30 @@ def restoring_beam_words(restoringbeam):
     if len(words) == 3:
         radians(words[2], "restoringbeam")
     return words
+
+
+def restored_beam(words, fitted):
+    """Return the beam of the restored image of one channel.
+
+    Parameters
+    ----------
+    words : list of str
+        Of `restoring_beam_words`.
+    fitted : dict
+        Of `fit_beam`.
+
+    Returns
+    -------
+    dict
+        {'major', 'minor', 'positionangle'}, each a CASA quantity.
+    """
+    import casatools
+
+    if words in ([], ["common"]):
+        return fitted
+    major, minor, angle = words if len(words) == 3 else (words[0], words[0], "0deg")
+    quantity = casatools.quanta().quantity
+    return dict(major=quantity(major), minor=quantity(minor), positionangle=quantity(angle))
 
 
 def restore(root, restoringbeam=(), specmode="mfs"):

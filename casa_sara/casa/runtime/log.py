@@ -104,6 +104,7 @@ class Progress:
         self._live = self._stream.isatty() and not _silent
         self._start = time.monotonic()
         self._first = None  # time and fraction at the end of the first iteration
+        self._first_draws = {}  # time and number of the draws of each name before the first
 
     def __call__(self, iteration, message, fraction=None):
         """Report the state after iteration number `iteration` (from 1).
@@ -127,6 +128,15 @@ class Progress:
         if iteration == 1 or iteration % self._interval == 0:
             info(line)
         self._draw(line, fraction)
+
+    def draw(self, name, number, asked):
+        """Report that so many draws of this name are made, 0 before the first, and the time that the others take."""
+        now = time.monotonic()
+        begin, before = self._first_draws.setdefault(name, (now, number))
+        left = f", about {_spell((now - begin) * (asked - number) / (number - before))} left" if number > before else ""
+        line = f"{name} {number} of {asked}; {_spell(now - self._start)} elapsed{left}"
+        info(line)
+        self._draw(line, number / max(asked, 1))
 
     def prepare(self, message, log=True):
         """Report what is done before the first iteration.
