@@ -49,6 +49,7 @@ def error_maps(path: str | Path, comparison: Comparison, weighting: str) -> bool
     sheet = Sheet([product.name for product in products], columns,
                   ny * cell[1] / (nx * cell[0]), celestial(comparison))
     for row, product in enumerate(products):
+        assert product.model_error is not None  # it comes with that of the smoothed model
         for column, image in enumerate((product.model, product.model_error)):
             draw(sheet.panel(row, column), image / pixel * factor, norm, cell)
         error = product.smoothed_error[weighting]
