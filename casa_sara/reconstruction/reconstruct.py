@@ -112,7 +112,8 @@ class Reconstruction:
         """Make it of its attributes as a checkpoint has them, the record as of :meth:`SolverRecord.state`."""
         record = SolverRecord()
         record.set_state(state["record"])
-        values = {name: np.array(value) if isinstance(value, np.ndarray) else value for name, value in state.items()}
+        values: dict[str, Any] = {name: np.array(value) if isinstance(value, np.ndarray) else value
+                                  for name, value in state.items()}
         return cls(**values | dict(record=record))
 
     @property
