@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 
 from casa_sara.analysis import metrics
+from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.sheets import BRIGHTNESS_MAP, DIFFERENCE_MAP, Sheet, celestial, draw, draw_beam, plain, prefix
 
 __all__ = ["error_maps", "features"]
@@ -17,7 +20,7 @@ NUMBERED = 12  # islands
 SMALLEST, REACH = 8, 1.2  # half side of a picture of a feature, in pixels, and in sizes of its region
 
 
-def error_maps(path, comparison, weighting: str) -> bool:
+def error_maps(path: str | Path, comparison: Comparison, weighting: str) -> bool:
     """Draw model, error and S/N at the beam of a weighting, a row for each product with draws; tell if there are any.
 
     Parameters
@@ -28,6 +31,10 @@ def error_maps(path, comparison, weighting: str) -> bool:
         Whose products may have draws.
     weighting : str
         Of the beam.
+
+    Returns
+    -------
+    bool
     """
     products = [product for product in comparison.products if weighting in product.smoothed_error]
     if not products:
@@ -66,8 +73,20 @@ def _numbered(product, comparison):
     return (product.record.get("islands") or [])[:NUMBERED]
 
 
-def features(path, comparison) -> bool:
-    """Draw the models with and without emission in each region that was tested; tell whether there was any."""
+def features(path: str | Path, comparison: Comparison) -> bool:
+    """Draw the models with and without emission in each region that was tested; tell whether there was any.
+
+    Parameters
+    ----------
+    path : str or Path
+        Of the picture.
+    comparison : casa_sara.analysis.comparison.Comparison
+        Whose products may have features.
+
+    Returns
+    -------
+    bool
+    """
     rows = [(f"{product.name}, {name}: {test[0]['sigma']:.2g} σ, p = {test[0]['p_value']:.2g}", *test[1:])
             for product in comparison.products for name, test in product.features.items()]
     if not rows:

@@ -150,6 +150,15 @@ class Jackknife(Bootstrap):
 def jackknife_groups(blocks: int) -> int:
     """Return into how many groups a jackknife divides so many blocks.
 
+    Parameters
+    ----------
+    blocks : int
+        Of the data.
+
+    Returns
+    -------
+    int
+
     Raises
     ------
     ValueError

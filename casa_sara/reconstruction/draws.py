@@ -115,7 +115,22 @@ class Draws:
 
     @classmethod
     def of(cls, arrays: dict[str, np.ndarray]) -> Draws:
-        """Make it of what :meth:`arrays` has returned; raise ValueError where these do not fit together."""
+        """Make it of what :meth:`arrays` has returned.
+
+        Parameters
+        ----------
+        arrays : dict
+            By name.
+
+        Returns
+        -------
+        Draws
+
+        Raises
+        ------
+        ValueError
+            They do not fit together.
+        """
         if not arrays["counts"].sum() == arrays["pixels"].size == arrays["values"].size:
             raise ValueError("its arrays do not fit together")
         places = np.cumsum(arrays["counts"])[:-1]

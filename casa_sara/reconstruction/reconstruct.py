@@ -109,7 +109,17 @@ class Reconstruction:
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Reconstruction:
-        """Make it of its attributes as a checkpoint has them, the record as of :meth:`SolverRecord.state`."""
+        """Make it of its attributes as a checkpoint has them.
+
+        Parameters
+        ----------
+        state : dict
+            Attributes by name; the record as of :meth:`SolverRecord.state`.
+
+        Returns
+        -------
+        Reconstruction
+        """
         record = SolverRecord()
         record.set_state(state["record"])
         values: dict[str, Any] = {name: np.array(value) if isinstance(value, np.ndarray) else value
