@@ -50,7 +50,7 @@ def error_maps(path: str | Path, comparison: Comparison, weighting: str) -> bool
                   ny * cell[1] / (nx * cell[0]), celestial(comparison))
     for row, product in enumerate(products):
         for column, image in enumerate((product.model, product.model_error)):
-            draw(sheet.panel(row, column), image / pixel * factor, norm, cell)
+            draw(sheet.panel(row, column), np.asarray(image) / pixel * factor, norm, cell)
         error = product.smoothed_error[weighting]
         found = metrics.smooth(product.model, beam[:2], beam[2], cell)
         ratio = np.divide(found, error, out=np.zeros_like(found), where=error > 1e-3 * error.max())
