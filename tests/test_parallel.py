@@ -30,7 +30,7 @@ SKY = [(1.0, -12 * ARCSEC, 7 * ARCSEC), (0.4, 9 * ARCSEC, -10 * ARCSEC), (0.5, 0
 GRID = dict(imsize=72, cell="0.9arcsec", datacolumn="data", nthreads=1)
 LIMIT = 300  # s; a quiet machine needs a tenth
 AGREE = 1e-5
-ERRORS_AGREE = 1e-3  # differences of images, in single precision
+ERRORS_AGREE = 1e-2  # differences of two images, in single precision, after the same random numbers
 WILD = 1e4
 
 mpi = pytest.mark.skipif(shutil.which("mpirun") is None or importlib.util.find_spec("mpi4py") is None
