@@ -58,7 +58,8 @@ class Spectrum:
 class ImageGrid:
     """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
 
-    `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis are
+    `spectrum` is what `spectralindex` stands for, once it has been read, and `mosaic` the primary beams of gridder='mosaic', a
+    :class:`casa_sara.operators.mosaic.Mosaic`. `start` and `width` of a cube's spectral axis are
     '', a channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say where the
     model may be.
     """
@@ -72,6 +73,8 @@ class ImageGrid:
     gridder: str = "standard"
     spectralindex: str = ""
     spectrum: Spectrum | None = None
+    mosaic: Any = None
+    onepointing: bool = False
     specmode: str = "mfs"
     nchan: int = -1
     start: int | str = ""
@@ -88,6 +91,11 @@ class ImageGrid:
     def is_cube(self) -> bool:
         """Whether the image has a plane for each channel."""
         return self.specmode == "cube"
+
+    @property
+    def is_mosaic(self) -> bool:
+        """Whether the model is the sky, seen through the primary beam of each pointing."""
+        return self.gridder == "mosaic"
 
     @property
     def masked(self) -> bool:

@@ -32,6 +32,7 @@ from casa_sara.imaging.data_quality import (
     thermal_noise,
 )
 from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.mosaic import beam_weights, check_pointings, flat_noise, w_note, with_beams
 from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
 from casa_sara.operators.measurement import Summed, check_cell, check_field
@@ -95,7 +96,7 @@ class Split:
 
 @dataclass
 class PlaneImages:
-    """The images of one plane: `pixels` are 'psf', 'residual' and 'model', float32 (nx, ny); `weights` (M,) made them."""
+    """The images of one plane: `pixels` are 'psf', 'residual', 'model' and, of a mosaic, 'weight'; `weights` (M,) made them."""
 
     pixels: dict[str, np.ndarray]
     weights: np.ndarray
@@ -208,9 +209,15 @@ class _Solution:
 def _read(request):
     """Return this rank's visibilities, and the plane of the image with its first model and support."""
     grid, output, comm = request.grid, request.output, request.ranks.comm
-    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), request.ranks)
+    frequencies = bool(grid.spectralindex) or grid.is_mosaic
+    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, request.ranks)
+    data.notes.extend(check_pointings(data, grid))
+    if grid.is_mosaic:
+        data, grid = with_beams(data, request.selection, grid)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
+    if grid.is_mosaic:
+        plane = plane.of_mosaic(_weight_image(data, grid, imaging_weights(data, grid, request.weighting, comm)), output.pblimit)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
@@ -270,6 +277,8 @@ def _look_back(images, plane, solution, comm):
     if plane.support is not None:
         pixels["mask"] = check_confined(pixels["model"], plane.support)
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
+        if "weight" in pixels:  # of flat noise
+            sigma /= float(pixels["weight"].max()) ** 0.5
         _caution(data, left_outside(pixels["residual"], plane.support, sigma))
     return doubtful
 
@@ -316,12 +325,18 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     PlaneImages
     """
     weights, operator, psf, beam = _point_spread(data, grid, weighting, options, plane, comm)
+    if grid.is_mosaic:
+        operator = _operator(data, grid, options, comm)
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
+    pixels = dict(psf=psf, residual=residual, model=model)
+    if grid.is_mosaic:
+        pixels["weight"] = _weight_image(data, grid, weights)
+        pixels["residual"] = flat_noise(residual, pixels["weight"])
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too
         sumwt = float(weights.sum(dtype=float))
     else:
         sumwt = sum_of_weights(data, weights, grid.stokes)
-    return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, comm.total(sumwt), beam)
+    return PlaneImages(pixels, weights, comm.total(sumwt), beam)
 
 
 def _caution(data, notes=None):
@@ -356,14 +371,28 @@ def _peak(name):
 def _predicted(operator, data, grid, options, model, comm):
     """Return the visibilities of a model, by the operator of the dirty images unless there is a spectrum."""
     if grid.spectrum is not None:
-        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm)
+        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm,
+                                beam=data.beam)
     return operator.forward(model)
 
 
+def _operator(data, grid, options, comm):
+    """Return the operator of the dirty images, for flat spectra."""
+    return Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm, beam=data.beam), comm)
+
+
+def _weight_image(data, grid, weights):
+    """Return the weight of the data at each place of the sky, tclean's .weight of a mosaic, real (nx, ny)."""
+    return grid.mosaic.power(beam_weights(grid.mosaic, data.beam, weights)) / np.float32(weights.sum(dtype=float))
+
+
 def _point_spread(data, grid, weighting, options, plane, comm):
-    """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and the beam fitted to it."""
+    """Return the imaging weights, the operator of the dirty images, the PSF and the beam fitted to it.
+
+    The PSF of a mosaic is that of all samples without their primary beams.
+    """
     weights = imaging_weights(data, grid, weighting, comm)
-    operator = Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm), comm)
+    operator = _operator(data, replace(grid, gridder="standard", mosaic=None) if grid.is_mosaic else grid, options, comm)
     psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
     return weights, operator, psf, comm.once(fit_beam, psf, plane)
 
@@ -380,6 +409,8 @@ def image_limits(data, grid, comm=SERIAL):
     if pixels < FEWEST_PIXELS:
         notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below {FEWEST_PIXELS:g} "
                      f"sources between pixels cannot be represented; 5 would be cell = '{arcsec * pixels / 5:.3g}arcsec'")
+    if grid.is_mosaic:
+        return notes + w_note(data, grid.mosaic, LARGEST_W_PHASE)
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
     phase = np.pi * max_w * corner_sq
     if phase > LARGEST_W_PHASE and grid.gridder == "standard":

@@ -1,4 +1,4 @@
-"""The measurement operator of an image: two-dimensional, with the w-term, or with a known spectrum.
+"""The measurement operator of an image: two-dimensional, with the w-term, of a mosaic, or with a known spectrum.
 
 Where the brightness follows a power law of the frequency with a known index,
 
@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, NoVisibilities, share_of
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
+from casa_sara.operators.mosaic import MosaicOperator
 from casa_sara.operators.widefield import WGridder, WTerm, w_operator
 from casa_sara.options import LARGEST_INDEX, ImageGrid
 from casa_sara.parallel.serial import SERIAL, Serial
@@ -31,8 +32,8 @@ GRIDDER_SAMPLE, GRIDDER_PIXEL = 80, 80  # what it holds, and the grids and indic
 
 def sky_operator(uvw: np.ndarray, grid: ImageGrid, freq_hz: np.ndarray | None = None,
                  row_scale: np.ndarray | None = None, eps: float = 1e-6, dtype: npt.DTypeLike = np.float32,
-                 nthreads: int = 1,
-                 comm: Serial = SERIAL) -> MeasurementOperator | ModulatedOperator | WGridder | NoVisibilities:
+                 nthreads: int = 1, comm: Serial = SERIAL, beam: np.ndarray | None = None,
+                 ) -> MeasurementOperator | ModulatedOperator | MosaicOperator | WGridder | NoVisibilities:
     """Return the measurement operator of an image.
 
     Parameters
@@ -40,15 +41,19 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid, freq_hz: np.ndarray | None = 
     uvw : float64 (3, M)
         Baselines in wavelengths.
     grid : casa_sara.options.ImageGrid
-        `shape`, `cell_rad`, `gridder` and `spectrum` decide.
+        `shape`, `cell_rad`, `gridder`, `mosaic` and `spectrum` decide.
     freq_hz : real (M,), optional
         Frequencies; without them the sky is as bright at all frequencies as at the reference.
     row_scale, eps, dtype, nthreads
         As of :class:`casa_sara.operators.measurement.MeasurementOperator`, whose interface the result has.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the visibilities are spread; the result is of this rank's.
+    beam : int (M,), optional
+        Number of the primary beam of each sample, of a mosaic.
     """
     def of_place(row_scale, eps):
+        if grid.mosaic is not None:
+            return MosaicOperator(uvw, beam, grid.mosaic, row_scale, eps, dtype, nthreads)
         return _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm)
 
     spectrum = grid.spectrum if freq_hz is not None else None

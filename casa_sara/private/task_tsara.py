@@ -59,6 +59,7 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
                           tuple(parameters["uvtaper"]))
     options = _solver_options(parameters, comm)
     _refuse_for_cubes(parameters)
+    _refuse_for_mosaics(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"] and comm.size > 1:
         raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is in "
@@ -129,7 +130,7 @@ def _grid(parameters):
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
                      spectralindex=_spectral_index(parameters), usemask=parameters["usemask"], mask=_mask(parameters),
-                     pbmask=parameters["pbmask"], **_spectral(parameters))
+                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], **_spectral(parameters))
 
 
 def _spectral_index(parameters):
@@ -173,6 +174,18 @@ def _refuse_for_cubes(parameters):
                          "image only; should be 0")
     if parameters["report"]:
         raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be False")
+
+
+def _refuse_for_mosaics(parameters):
+    """Raise on parameters that mosaics do not have."""
+    if parameters["gridder"] != "mosaic":
+        return
+    for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
+                                ("parallel", False, "a mosaic takes one process"),
+                                ("savemodel", "none", "MODEL_DATA is written of single pointings only"),
+                                ("report", False, "reports are made of single pointings only")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
 
 
 def _check_stokes(parameters):

@@ -90,7 +90,7 @@ class Findings:
 class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
-    `support` is None where all may.
+    `support` is None where all may. Of a mosaic the sky is the image times `sky_over_image`.
     """
 
     samples: Samples
@@ -100,6 +100,7 @@ class Problem:
     data_norm_sq: float
     unit_jy: float
     support: np.ndarray | None = None
+    sky_over_image: np.ndarray | None = None
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions, unit_jy: float, eps: float,
@@ -132,13 +133,28 @@ class Problem:
         vis = data.vis * sqrt_weight
         sqrt_weight *= np.float32(unit_jy)
         measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=sqrt_weight, eps=eps,
-                                   nthreads=options.nthreads, comm=comm)
+                                   nthreads=options.nthreads, comm=comm, beam=data.beam)
         precond = _preconditioner(samples, options.precondition, comm)
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
             data_norm_sq = comm.bcast(power_method(
                 lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32))
-        return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support)
+        return cls(samples, vis, measurement, precond, data_norm_sq, unit_jy, support, grid.mosaic and grid.mosaic.over)
+
+    def flux_jy(self, image: np.ndarray) -> float:
+        """Return Σ|I| of the sky of an image, which no visibility of it exceeds.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            In `unit_jy`.
+
+        Returns
+        -------
+        float
+        """
+        sky = image if self.sky_over_image is None else image * self.sky_over_image
+        return self.unit_jy * float(np.abs(sky).sum(dtype=float))
 
 
 def first_image(samples: Samples, problem_of: Callable[..., Problem], options: SolverOptions,
@@ -171,8 +187,7 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         first, residual = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                                positivity=options.positivity, stopped=stopped, support=problem.support)
         samples = problem.samples
-        found = find_wild(samples.data, samples.offsets, residual,
-                          problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
+        found = find_wild(samples.data, samples.offsets, residual, problem.flux_jy(first), comm)
         if comm.total(found.index.size) == 0:
             break
         wild += _told_of_all(found, samples, layout, comm)

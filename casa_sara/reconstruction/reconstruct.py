@@ -16,6 +16,7 @@ from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.flat_noise import FlatNoise
 from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
 from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
 from casa_sara.reconstruction.state_file import digest
@@ -122,6 +123,9 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         The state that was read is not one of these data.
     """
     comm, checkpoint = ranks.comm, control.checkpoint
+    flat = FlatNoise.of(samples.data, grid, comm)
+    if flat is not None:
+        grid, support, startmodel = flat.grid(grid), flat.support(support), flat.image(startmodel)
     check_l2bound(options, len(samples.offsets) - 1)
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(comm.mean(samples.data.weight, dtype=float) ** -0.5)
@@ -137,7 +141,8 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         if control.stopped():
             control = replace(control, checkpoint=None)
     record = _iterate(solution, options, control, layout, ranks)
-    return _result(solution, record, samples, comm)
+    found = _result(solution, record, samples, comm)
+    return found if flat is None else flat.of_sky(found)
 
 
 def _identify(checkpoint, samples, layout, grid, support, comm):
@@ -148,7 +153,8 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
                if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
     spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
-        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex).items()}
+        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex,
+        sensitivity=grid.mosaic and grid.mosaic.over).items()}
     comm.once(checkpoint.identify, **digests)
 
 
@@ -208,7 +214,7 @@ class _Solution:
         else:
             ppd = AdaptivePPD(measurement, dictionary, problem.vis, samples.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=ranks.comm)
-        ppd.unit_jy = problem.unit_jy
+        ppd.unit_jy, ppd.sky_over_image = problem.unit_jy, problem.sky_over_image
         if problem.support is not None:
             ppd.confine(problem.support)
         weights = samples.data.weight * np.float32(problem.unit_jy**2)

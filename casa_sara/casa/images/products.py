@@ -1,5 +1,5 @@
 """What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
-(.mask .image.pbcor .model.pbcor), and the record .sara.json.
+(.mask .image.pbcor .model.pbcor), .weight of a mosaic, and the record .sara.json.
 
 They appear together (:mod:`casa_sara.runtime.atomic`), and replace those of an older run of this name together.
 """
@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor")
+ON_REQUEST = (".mask", ".weight", ".image.pbcor", ".model.pbcor")
 CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
 
@@ -106,7 +106,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     plane : ImagePlane
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
-        residual in Jy/beam) and 'model' in Jy/pixel; 'mask' where there is one.
+        residual in Jy/beam) and 'model' in Jy/pixel; 'mask' where there is one, 'weight' of a mosaic.
     sumwt : float, or one for each channel
     beam : dict
         Of `restore.fit_beam`, or a list with one for each channel.
@@ -120,7 +120,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     OSError
         The images could not be written, as on a full disk; everything is as it was before.
     """
-    more = 2 * output.pbcor + ("mask" in images)
+    more = 2 * output.pbcor + ("mask" in images) + ("weight" in images)
     check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
@@ -138,15 +138,22 @@ def write_images(root, plane, images, sumwt, beam, restoringbeam, history, pbcor
     plane = ImagePlane(**plane)
     write_image(root + ".psf", images["psf"], plane, beam=beam)
     write_image(root + ".residual", images["residual"], plane, masked=plane.masks_all)
-    write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
+    seen = images["model"]
+    if plane.sky_model:  # restored is what is seen of it, of flat noise as .residual
+        seen = seen * np.sqrt(images["weight"] / images["weight"].max())
+        write_image(root + ".weight", images["weight"], plane)
+    write_image(root + ".model", seen, plane, unit="Jy/pixel")
     write_image(root + ".pb", plane.pb, plane, masked=True)
     write_image(root + ".sumwt", sumwt.reshape(-1, 1, 1), plane)
     if restoringbeam is not None:
         restore(root, restoringbeam, "cube" if plane.pb.ndim == 3 else "mfs")
+    if plane.sky_model:
+        shutil.rmtree(root + ".model")
+        write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
     if "mask" in images:
         write_image(root + ".mask", images["mask"], plane)
     if pbcor:
-        write_corrected(root, plane, images["model"])
+        write_corrected(root, plane, seen)
     for path in existing_products(root):
         with opened("image", path) as ia:
             ia.sethistory(origin="tsara", history=list(history))

@@ -1,0 +1,132 @@
+"""What a mosaic needs between reading and solving: the primary beams of its samples, and images of flat noise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from casa_sara.casa.images.primary_beams import primary_beams
+from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, separation
+from casa_sara.casa.runtime import log
+from casa_sara.operators.mosaic import Beam, Mosaic, remaining_w_phase
+from casa_sara.parallel.serial import SERIAL
+
+__all__ = ["beam_weights", "check_pointings", "flat_noise", "w_note", "with_beams"]
+
+SAME_POINTING = 1e-6  # rad, the least that fields may be apart
+SAME_BEAM = 0.01  # of the beam of a dish of 25 m, the largest that is common
+LARGEST_DISH_M = 25.0
+ARCSEC_PER_RAD = 180 * 3600 / np.pi
+
+
+def check_pointings(data, grid):
+    """Return the notes about fields in different directions that are imaged as one pointing.
+
+    Parameters
+    ----------
+    data : casa_sara.data.visibilities.Visibilities
+    grid : casa_sara.options.ImageGrid
+
+    Returns
+    -------
+    list of str
+
+    Raises
+    ------
+    ValueError
+        They would be imaged as one pointing, and onepointing = True has not been said.
+    """
+    directions = list(data.fields.values())
+    if grid.is_mosaic or not directions:
+        return []
+    spread = max(separation(direction, directions[0]) for direction in directions)
+    wavelength = SPEED_OF_LIGHT / max(data.freq_range_hz[1], 1.0)
+    if spread <= max(SAME_POINTING, SAME_BEAM * wavelength / LARGEST_DISH_M):
+        return []
+    apart = f"{len(directions)} fields, up to {spread * ARCSEC_PER_RAD:.1f} arcsec apart"
+    if not grid.onepointing:
+        raise ValueError(f"gridder = '{grid.gridder}': {apart}, would be imaged as one pointing: should be gridder = 'mosaic', "
+                         "which models their primary beams, or one field, chosen with field. onepointing = True images them "
+                         "as one pointing nevertheless")
+    return [f"{apart}, are imaged as one pointing: their different primary beams are not modelled"]
+
+
+def with_beams(data, selection, grid):
+    """Find the primary beams of the samples, and leave out the samples that see nothing of the image.
+
+    Parameters
+    ----------
+    data : casa_sara.data.visibilities.Visibilities
+        With `freq_hz` and `fields`.
+    selection : casa_sara.options.Selection
+    grid : casa_sara.options.ImageGrid
+
+    Returns
+    -------
+    data : Visibilities
+        With `beam`.
+    grid : ImageGrid
+        With `mosaic`.
+
+    Raises
+    ------
+    ValueError
+        The beams are not known, or no pointing sees the centre of the image.
+    """
+    centres, profiles, pairs, beam, words = primary_beams(data, selection, grid)
+    log.info(words)
+    beams = [Beam((float(centres[p, 0]), float(centres[p, 1])), *profiles[k]) for p, k in pairs]
+    inside = np.array([all(part.stop > part.start for part in one.box(grid.shape, grid.cell_rad)) for one in beams])
+    if inside.any():
+        mosaic = Mosaic(grid.shape, grid.cell_rad, tuple(one for one, seen in zip(beams, inside) if seen))
+        data = _inside(replace(data, beam=beam), inside)
+        middle = mosaic.sensitivity(beam_weights(mosaic, data.beam, data.weight))[grid.shape[0] // 2, grid.shape[1] // 2]
+    if not inside.any() or not middle > 0:
+        raise ValueError(f"phasecenter = '{grid.phasecenter}': no pointing sees the centre of the image: should be a direction "
+                         "within the mosaic")
+    return data, replace(grid, mosaic=mosaic)
+
+
+def _inside(data, inside):
+    """Return the samples whose beam is in the image, with the beams numbered anew, and say how many are not."""
+    data.beam = (np.cumsum(inside) - 1).astype(np.int32)[data.beam] + np.where(inside[data.beam], 0, -len(inside))
+    kept = np.flatnonzero(data.beam >= 0)
+    beyond = data.size - kept.size
+    if not beyond:
+        return data
+    note = f"{beyond} visibilities are of pointings that see nothing of the image, and are left out"
+    return replace(data.part(kept), dropped=data.dropped | {"beyond the image": beyond}, notes=[*data.notes, note])
+
+
+def w_note(data, mosaic, largest):
+    """Return the warning about the w-term that a mosaic leaves out, where it is more than `largest` rad."""
+    phase = remaining_w_phase(data.max_w, mosaic)
+    if phase <= largest:
+        return []
+    return [f"the w-term is modelled to first order around each pointing: what is left out changes phases by up to {phase:.2g} "
+            "rad at the edges of the primary beams; there is no gridder yet that models both"]
+
+
+def beam_weights(mosaic, beam_of_sample, weights, comm=SERIAL):
+    """Return the summed weight of the samples of each beam, float64 (B,), of all ranks."""
+    return comm.allreduce(np.bincount(beam_of_sample, weights, len(mosaic.beams)))
+
+
+def flat_noise(dirty, weight):
+    """Return Φ†(w V)/Σw of a mosaic as tclean's image of flat noise, sky × primary beam, real (nx, ny).
+
+    Parameters
+    ----------
+    dirty : real (nx, ny)
+        Σ_g A_g F†(w V)/Σw.
+    weight : real (nx, ny)
+        Σ_g W_g A_g²/Σw, tclean's .weight.
+
+    Returns
+    -------
+    real (nx, ny)
+        dirty/√(weight·largest weight), 0 where nothing is seen.
+    """
+    norm = np.sqrt(weight * weight.max())
+    return np.divide(dirty, norm, out=np.zeros_like(dirty), where=norm > 0)
