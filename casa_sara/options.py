@@ -105,12 +105,16 @@ class ImageGrid:
 
 @dataclass(frozen=True)
 class Weighting:
-    """Imaging weights of .psf, .residual and .image; they never touch the model."""
+    """Imaging weights of .psf, .residual and .image; they never touch the model.
+
+    `mosweight` says that the fields of a mosaic are weighted separately.
+    """
 
     weighting: str = "natural"
     robust: float = 0.5
     npixels: int = 0
     uvtaper: tuple[str, ...] = ()
+    mosweight: bool = True
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from importlib.metadata import version
 
 import numpy as np
@@ -22,6 +23,7 @@ from casa_sara.casa.ms.weights import dirty_image, imaging_weights
 from casa_sara.casa.runtime import log
 from casa_sara.comparison.injection import Injection, can_be_repeated, recover, spectral_index_of
 from casa_sara.data.blocks import snapshot_blocks
+from casa_sara.imaging.mosaic import check_pointings
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import Comparing, ImageGrid, Selection, Weighting
@@ -137,6 +139,10 @@ def _read(request, with_residual, fewest):
     if len(set(names)) < len(names) or any("|" in name or not name.strip() for name in names):
         raise ValueError(f"names = {list(names)}: should differ, not be empty, and hold no '|'")
     sets = [read_image_set(given, name, with_residual) for given, name in zip(models, names or [""] * len(models))]
+    for given, one in zip(models, sets):
+        if one.parameters.get("gridder", "").startswith("mosaic"):
+            raise ValueError(f"models: '{given}' was imaged with gridder = 'mosaic': the comparison takes images of single "
+                             "pointings only")
     taken = set()
     for number, one in enumerate(sets):
         name = one.name.replace("|", "_")
@@ -288,7 +294,7 @@ class _Observed:
         grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
         with kernels_loading(log.info):
             data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
-        notes.extend(data.notes)
+        notes.extend(data.notes + check_pointings(data, replace(grid, onepointing=True)))
         self._gridder = _common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)
         notes.extend(image_plane.notes)

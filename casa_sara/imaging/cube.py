@@ -18,6 +18,7 @@ from casa_sara.data.visibilities import Visibilities
 from casa_sara.imaging.continuum import Result, describe, image_limits, nowhere_visible, plane_images, split
 from casa_sara.imaging.cube_checkpoint import CubeCheckpoint
 from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.mosaic import check_pointings
 from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
 from casa_sara.options import ImageGrid, Limits, Output, Selection, SolverOptions, Weighting
@@ -101,7 +102,7 @@ def make_cube(selection: Selection, grid: ImageGrid, weighting: Weighting, optio
     # read
     with kernels_loading(log.info):
         data = read_visibilities(selection, grid.phasecenter, grid.stokes)
-    data.notes.extend(image_limits(data, grid))
+    data.notes.extend(check_pointings(data, grid) + image_limits(data, grid))
     cube = _Cube.of(_Request(selection, grid, weighting, options, output), data, forecast.workload.channels)
     check_imagename(output.imagename, cube.plane.pb.shape, 2 * output.pbcor)
     for note in data.notes:

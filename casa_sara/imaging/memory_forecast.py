@@ -67,7 +67,7 @@ class Workload:
         writes, bases = ranks.comm.rank == 0, len(options.wavelets)
         return cls(math.ceil(volume.samples * ranks.share), volume.reach, grid.shape, grid.cell_rad,
                    len(ranks.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
-                   options.precondition, report and writes, grid.gridder, volume.max_w, bool(grid.spectralindex), band,
+                   options.precondition, report and writes, grid.gridder, volume.max_w, bool(grid.spectralindex) or grid.is_mosaic, band,
                    channels, share, grid.masked, (volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
                    options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    3 if options.method == "dabbech2018" else 2)

@@ -86,7 +86,8 @@ def measure(data, offsets, grid, options, reading):
     scale = np.sqrt(data.weight)
     vis = data.vis * scale
     eps = operator_accuracy(data, offsets, noise_from_differences(data, offsets))
-    measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=scale, eps=eps, nthreads=options.nthreads)
+    measurement = sky_operator(data.uvw, grid, data.freq_hz, row_scale=scale, eps=eps, nthreads=options.nthreads,
+                               beam=data.beam)
     building = time.perf_counter() - start
     image, precond = np.ones(grid.shape, np.float32), np.ones(data.size, np.float32)
     bound = float(data.weight.sum(dtype=float)) * math.prod(grid.shape)  # of the operator's squared norm

@@ -27,6 +27,7 @@ from casa_sara.runtime import jit
 __all__ = ["Beam", "Mosaic", "MosaicOperator", "mosaic_density", "remaining_w_phase"]
 
 LEAST = 0.05  # of the largest sensitivity, that of the mosaic where it ends
+REACH_STEPS = 4  # values of the largest baseline, in a factor of 2, that plans are made for
 COARSE = 128  # pixels along an image in which the overlap of beams is summed
 
 
@@ -239,12 +240,20 @@ class _Part:
         n = np.sqrt(1 - l**2 - m**2)
         cycles = u * l + v * m + w * (n - 1)
         self.rotation = np.exp(2j * np.pi * (cycles - np.rint(cycles))).astype(np.result_type(dtype, np.complex64))
-        self.operator = MeasurementOperator(np.array([u - w * (l / n), v - w * (m / n)]), cell, self.shape,
-                                            np.asarray(row_scale)[samples], eps, dtype, workers)
+        uv = np.array([u - w * (l / n), v - w * (m / n)])
+        self.operator = MeasurementOperator(uv, cell, self.shape, np.asarray(row_scale)[samples], eps, dtype, workers,
+                                            (samples.size, _reach(uv, cell)))
 
     def space(self, pixels, vis):
         """Return as much as this part needs of the space that all share."""
         return pixels[: self.pixels].reshape(self.shape), vis[: self.index.size]
+
+
+def _reach(uv, cell):
+    """Largest |u| and |v| to plan for: those of the samples up to the next of few values, so that plans are alike."""
+    cycles = np.abs(uv).max(axis=1) * cell
+    steps = np.ceil(REACH_STEPS * np.log2(np.maximum(cycles, 1e-6)))
+    return np.maximum(np.minimum(2 ** (steps / REACH_STEPS), 0.5), cycles) / cell
 
 
 def remaining_w_phase(max_w: float, mosaic: Mosaic) -> float:

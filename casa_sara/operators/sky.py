@@ -28,6 +28,7 @@ __all__ = ["further_bytes", "sky_operator"]
 # bytes of one sample and of one pixel, beyond what the plain operator has
 SERIES_SAMPLE, SERIES_PIXEL = 16, 16  # rotation and one term; place, two polynomials and one image
 GRIDDER_SAMPLE, GRIDDER_PIXEL = 80, 80  # what it holds, and the grids and indices of a call
+MOSAIC_SAMPLE, MOSAIC_PIXEL = 24, 24  # rotation, index and beam, and the visibilities of one beam; images of flat noise
 
 
 def sky_operator(uvw: np.ndarray, grid: ImageGrid, freq_hz: np.ndarray | None = None,
@@ -110,6 +111,8 @@ def further_bytes(samples: int, grid: Any, max_w: float = 0.0, band: float = 0.0
         terms = WTerm.of(max_w, grid.shape, grid.cell_rad, eps).terms
         size += (SERIES_SAMPLE + 4 * terms) * samples + SERIES_PIXEL * pixels if terms else \
             GRIDDER_SAMPLE * samples + GRIDDER_PIXEL * pixels
+    if grid.gridder == "mosaic":
+        size += MOSAIC_SAMPLE * samples + MOSAIC_PIXEL * pixels
     if band > 0:
         terms = terms_needed(LARGEST_INDEX * band, eps / 4, modified=True)
         size += (SERIES_SAMPLE + 4 * terms) * samples + SERIES_PIXEL * pixels

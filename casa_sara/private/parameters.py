@@ -61,6 +61,8 @@ TSARA = (
     Parameter('gridder', ('string',), 'standard', 'Gridding options (standard, wproject, mosaic)', allowed=('standard', 'wproject', 'mosaic')),
     Parameter('onepointing', ('bool',), False, 'Image fields in different directions as one pointing', opener='gridder', open_on=('standard', 'wproject')),
     Parameter('wprojplanes', ('int',), -1, 'Accepted for compatibility with tclean; the w-term needs no planes here', minimum=-1.0, opener='gridder', open_on=('wproject',)),
+    Parameter('usepointing', ('bool',), False, 'The POINTING table is not used', allowed=(False,), opener='gridder', open_on=('mosaic',)),
+    Parameter('mosweight', ('bool',), True, 'Weight the fields of a mosaic separately', opener='gridder', open_on=('mosaic',)),
     Parameter('pblimit', ('double',), 0.2, 'PB gain level at which to cut off normalizations', minimum=-1.0, maximum=1.0),
     Parameter('weighting', ('string',), 'natural', 'Weighting scheme of the psf, residual and restored images (natural, uniform, briggs)', allowed=('natural', 'uniform', 'briggs')),
     Parameter('robust', ('double',), 0.5, 'Robustness parameter', minimum=-2.0, maximum=2.0, opener='weighting', open_on=('briggs',)),

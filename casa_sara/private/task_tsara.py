@@ -44,6 +44,7 @@ ARCSEC = math.pi / 180 / 3600
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     _check_method(parameters)
+    _refuse_for_mosaics(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -56,10 +57,9 @@ def run(parameters: dict[str, Any], comm=SERIAL) -> dict[str, Any]:
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
-                          tuple(parameters["uvtaper"]))
+                          tuple(parameters["uvtaper"]), parameters["mosweight"])
     options = _solver_options(parameters, comm)
     _refuse_for_cubes(parameters)
-    _refuse_for_mosaics(parameters)
     limits = Limits(parameters["maxmem"], _seconds(parameters["maxtime"]), parameters["report"])
     if parameters["dryrun"] and comm.size > 1:
         raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is in "

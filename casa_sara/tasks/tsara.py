@@ -279,6 +279,17 @@ class _tsara:
         accepted. 1, tclean's default, would leave the w-term out, as gridder='standard' does, and is
         refused, as is 0.
 
+    usepointing : {False}, default False
+        Opened by gridder = 'mosaic'.
+        Primary beams are centred on PHASE_DIR of FIELD, as with tclean's default. Pointing directions of
+        single antennas in POINTING cannot be used.
+
+    mosweight : bool, default True
+        Opened by gridder = 'mosaic'.
+        With weighting='uniform' or 'briggs', whether the density of the visibilities is that of each field by
+        itself or, with False, that of all fields together, as in tclean. It acts on .psf, .residual,
+        .weight, .pb and .image, not on the model.
+
     pblimit : float, default 0.2
         Where the primary beam is below this, .pb is zero, and .pb, .residual, .image and the images
         that pbcor makes have no valid pixels (mask0), as in tclean. With a negative number its
@@ -587,14 +598,14 @@ class _tsara:
         intent='', datacolumn='corrected', imagename='', imsize=[100], cell=[], phasecenter='', stokes='I',
         projection='SIN', startmodel='', specmode='mfs', reffreq='', spectralindex='', nchan=-1, start='', width='',
         outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest', perchanweightdensity=True,
-        gridder='standard', onepointing=False, wprojplanes=-1, pblimit=0.2, weighting='natural', robust=0.5, npixels=0,
-        uvtaper=[], restoration=True, restoringbeam=[], pbcor=False, method='tsara', niter=100000,
-        wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
-        mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
-        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
-        reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, blocks=0, nthreads=0, dryrun=False,
-        maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False, overwrite=False, savemodel='none',
-        parallel=False,
+        gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False, mosweight=True, pblimit=0.2,
+        weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True, restoringbeam=[], pbcor=False,
+        method='tsara', niter=100000, wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'],
+        wavelevels=4, usemask='user', mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt',
+        boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20,
+        reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0,
+        blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False,
+        overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 
@@ -88,7 +89,7 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     uniform  w / G
     briggs   w / (G·f² + 1),  f² = (5·10^−robust)² / (ΣG²/ΣG)
 
-    times the Gaussian taper. `npixels` sets the uv cell of uniform and briggs to
+    times the Gaussian taper. With `mosweight`, G is that of each field of a mosaic. `npixels` sets the uv cell of uniform and briggs to
     1/(npixels·cell). Samples beyond the grid have no weight.
 
     Parameters
@@ -105,6 +106,8 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     """
     if weighting.weighting not in WEIGHTINGS:
         raise ValueError(f"weighting = '{weighting.weighting}' is not one of {', '.join(WEIGHTINGS)}")
+    if grid.is_mosaic and weighting.mosweight and weighting.weighting != "natural":
+        return _weights_by_field(visibilities, grid, replace(weighting, mosweight=False), comm)
     taper = _taper_parameters(weighting.uvtaper)
     weights = visibilities.imaging_weight.copy()
     if weighting.weighting == "natural" and taper is None:
@@ -126,6 +129,16 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
         weights = np.divide(weights, density, out=np.zeros_like(weights), where=density > 0, casting="same_kind")
     if taper is not None:
         weights *= _taper(u, v, *taper)
+    return weights
+
+
+def _weights_by_field(visibilities, grid, weighting, comm):
+    """Return the imaging weights of every field by itself, float32 (M,)."""
+    rows, weights = visibilities.rows, np.empty(visibilities.size, np.float32)
+    field = (rows.ms.astype(np.int64) * (int(comm.largest(int(rows.field.max(initial=0)))) + 1) + rows.field)[visibilities.row]
+    for number in np.unique(np.concatenate(comm.allgather(np.unique(field)))):
+        here = np.flatnonzero(field == number)
+        weights[here] = imaging_weights(visibilities.part(here), grid, weighting, comm)
     return weights
 
 
