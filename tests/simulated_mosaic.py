@@ -76,15 +76,16 @@ def predict(name, fields, sky, dishes):
 
 
 def simulate_mosaic(path, pointings, sky, dishes=(12.0,) * 8 + (7.0,) * 4, noise=0.02, spread=60.0, seed=1, gain_rms=0.0,
-                    spws=(("100GHz", "10MHz", 2),), scan_seconds=60.0, integration=20.0, rounds=1, telescope="ALMA", **options):
+                    spws=(("100GHz", "10MHz", 2),), scan_seconds=60.0, integration=20.0, rounds=1, hours=1.0, telescope="ALMA", **options):
     """Write a MeasurementSet of pointings (east, north) in arcsec from the centre; the sky is (Jy, l, m) around the centre.
 
+    The pointings follow one another, `rounds` times within `hours`.
     `noise` in Jy of baselines of two 12 m dishes; of others it grows as the areas of the dishes shrink.
     """
     fields = [direction(*pointing) for pointing in pointings]
     name = simulate(path, configuration=positions(dishes, spread, seed), telescope=telescope, correlations="XX YY", fields=fields,
                     spws=spws, scans=rounds * len(fields), scan_seconds=scan_seconds, integration=integration, sky=[(1.0, 0.0, 0.0)],
-                    spacing_seconds=scan_seconds * 1.25, **options)
+                    spacing_seconds=hours * 3600 / (rounds * len(fields)), hour_angle=-hours / 2, **options)
     edit(name + "/ANTENNA", "DISH_DIAMETER", lambda old: np.array(dishes))
     ends = np.asarray(dishes)[np.stack([column(name, "ANTENNA1"), column(name, "ANTENNA2")])]
     sigma = noise * (12.0 / ends[0]) * (12.0 / ends[1])

@@ -169,7 +169,8 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def mixed(folder):
     """Seven pointings, four rounds of them, dishes of 12 m and 7 m: four point sources."""
-    return simulate_mosaic(folder / "mixed.ms", HEXAGON, SKY, dishes=DISHES, noise=0.1, rounds=4, spread=45.0)
+    return simulate_mosaic(folder / "mixed.ms", HEXAGON, SKY, dishes=DISHES, noise=0.3, rounds=4, spread=45.0,
+                           hours=4.0)
 
 
 def seen_by(pair, freq_hz, place, pointing):
@@ -245,8 +246,8 @@ def test_weights_by_field_are_tcleans(mixed, tmp_path, monkeypatch, mosweight):
 def test_one_pointing_is_the_standard_image_over_its_beam(folder, tmp_path, monkeypatch):
     """Dishes of one kind, one field: flat noise is the standard image, the model its model over the beam."""
     monkeypatch.chdir(tmp_path)
-    name = simulate_mosaic(folder / "one.ms", [(0, 0)], SKY[:2], dishes=(12.0,) * 10, noise=0.05, rounds=3)
-    options = GRID | dict(vis=name, niter=30, phasecenter="", imsize=[160, 160])
+    name = simulate_mosaic(folder / "one.ms", [(0, 0)], SKY[:2], dishes=(12.0,) * 10, noise=0.3, rounds=12, hours=4.0)
+    options = GRID | dict(vis=name, phasecenter="", imsize=[320, 320], cell="0.45arcsec")
     tsara(imagename="mosaic", **options)
     tsara(imagename="plain", **options | dict(gridder="standard"))
     pb = pixels("mosaic.pb")
@@ -264,11 +265,11 @@ def test_one_pointing_is_the_standard_image_over_its_beam(folder, tmp_path, monk
 def test_sources_are_recovered_in_place_and_flux(mixed, tmp_path, monkeypatch):
     """At the centre of a pointing, between pointings, and where the beam of the mosaic is 0.2."""
     monkeypatch.chdir(tmp_path)
-    result = tsara(vis=mixed, imagename="x", pbcor=True, **GRID | dict(cell="0.45arcsec", imsize=[480, 432]))
+    result = tsara(vis=mixed, imagename="x", pbcor=True, **GRID | dict(cell="0.5arcsec", imsize=[360, 320]))
     assert result["stopcode"] == 101
     model, pb, seen = pixels("x.model"), pixels("x.pb"), []
     for flux, l, m in SKY:
-        x, y = 240 - l / ARCSEC / 0.45, 216 + m / ARCSEC / 0.45
+        x, y = 180 - l / ARCSEC / 0.5, 160 + m / ARCSEC / 0.5
         corner = int(x) - 10, int(y) - 10
         part = model[corner[0] : corner[0] + 21, corner[1] : corner[1] + 21].astype(float)
         seen.append(pb[round(x), round(y)])
