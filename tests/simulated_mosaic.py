@@ -1,7 +1,7 @@
 """Small simulated mosaics of ALMA's 12 m and 7 m dishes, with an exactly known sky, primary beams and noise.
 
-The visibilities are an explicit sum over point sources, each times the product of the voltage patterns of the two dishes
-of the baseline: Airy patterns of blocked dishes, as ALMA's are in CASA, written here anew.
+The visibilities are an explicit sum over point sources, each times the product of the voltage patterns of the two
+dishes of the baseline: Airy patterns of blocked dishes, as ALMA's are in CASA, written here anew.
 """
 
 import numpy as np
@@ -30,7 +30,7 @@ def direction(east_arcsec, north_arcsec):
     n = np.sqrt(1 - l * l - m * m)
     sin_dec = m * np.cos(dec) + n * np.sin(dec)
     right = ra + np.arctan2(l, n * np.cos(dec) - m * np.sin(dec))
-    return f"J2000 {np.degrees(right)!r}deg {np.degrees(np.arcsin(sin_dec))!r}deg".replace("np.float64(", "").replace(")", "")
+    return f"J2000 {float(np.degrees(right))!r}deg {float(np.degrees(np.arcsin(sin_dec)))!r}deg"
 
 
 def positions(dishes, spread, seed):
@@ -49,14 +49,17 @@ def positions(dishes, spread, seed):
     return ALMA[:, None] + np.outer(east, found[0]) + np.outer(north, found[1])
 
 
-def predict(name, fields, sky, dishes):
-    """Return the visibilities of point sources (Jy, l, m), around the centre, of all windows: complex (correlations, channels, rows)."""
-    flux, lmn = direction_cosines(fields, sky)
-    centres = direction_cosines([f"J2000 {CENTRE[0]!r}deg {CENTRE[1]!r}deg", *fields], sky)[1]
-    lmn = centres[1:]
+def explicit_sum(uvw, lmn, flux):
+    """Return Σ S exp(2πi(ul + vm + w(n − 1))), complex (M,), of uvw (3, M) in wavelengths and places (3, sources)."""
+    return np.exp(2j * np.pi * (uvw.T @ (lmn - np.array([0.0, 0.0, 1.0])[:, None]))) @ flux
+
+
+def predict(name, fields, sky, dishes, fourier_sum=explicit_sum):
+    """Return the visibilities of point sources (Jy, l, m) around the centre, by window: complex (channels, rows)."""
+    flux, lmn = direction_cosines([f"J2000 {CENTRE[0]!r}deg {CENTRE[1]!r}deg", *fields], sky)
+    lmn = lmn[1:]
     uvw, field, window = (column(name, what) for what in ("UVW", "FIELD_ID", "DATA_DESC_ID"))
     ends = np.asarray(dishes)[np.stack([column(name, "ANTENNA1"), column(name, "ANTENNA2")])]
-    angle = np.arccos(np.minimum(lmn[:, 2], 1.0))
     angle = np.arctan2(np.hypot(lmn[:, 0], lmn[:, 1]), lmn[:, 2])
     made = []
     for number in range(window.max() + 1):
@@ -69,27 +72,30 @@ def predict(name, fields, sky, dishes):
                     for other in set(dishes):
                         here = (field == k) & (ends[0] == one) & (ends[1] == other) & (window == number)
                         seen = flux * patterns[one][k] * patterns[other][k]
-                        cycles = uvw[:, here].T @ (lmn[k] - np.array([0.0, 0.0, 1.0])[:, None]) * (freq / SPEED_OF_LIGHT)
-                        vis[chan, here] = np.exp(2j * np.pi * cycles) @ seen
+                        if here.any():
+                            vis[chan, here] = fourier_sum(uvw[:, here] * (freq / SPEED_OF_LIGHT), lmn[k], seen)
         made.append(vis[:, window == number])
     return made
 
 
-def simulate_mosaic(path, pointings, sky, dishes=(12.0,) * 8 + (7.0,) * 4, noise=0.02, spread=60.0, seed=1, gain_rms=0.0,
-                    spws=(("100GHz", "10MHz", 2),), scan_seconds=60.0, integration=20.0, rounds=1, hours=1.0, telescope="ALMA", **options):
-    """Write a MeasurementSet of pointings (east, north) in arcsec from the centre; the sky is (Jy, l, m) around the centre.
+def simulate_mosaic(path, pointings, sky, dishes=(12.0,) * 8 + (7.0,) * 4, noise=0.02, spread=60.0, seed=1,
+                    gain_rms=0.0, spws=(("100GHz", "10MHz", 2),), scan_seconds=60.0, integration=20.0, rounds=1,
+                    hours=1.0, places=None, fourier_sum=explicit_sum):
+    """Write a MeasurementSet of pointings (east, north) in arcsec from the centre, of a sky (Jy, l, m) around it.
 
     The pointings follow one another, `rounds` times within `hours`.
+    `places` (3, N) are the antennas, ITRF in metres; random ones within `spread` metres unless given.
     `noise` in Jy of baselines of two 12 m dishes; of others it grows as the areas of the dishes shrink.
     """
     fields = [direction(*pointing) for pointing in pointings]
-    name = simulate(path, configuration=positions(dishes, spread, seed), telescope=telescope, correlations="XX YY", fields=fields,
-                    spws=spws, scans=rounds * len(fields), scan_seconds=scan_seconds, integration=integration, sky=[(1.0, 0.0, 0.0)],
-                    spacing_seconds=hours * 3600 / (rounds * len(fields)), hour_angle=-hours / 2, **options)
+    places = positions(dishes, spread, seed) if places is None else places
+    name = simulate(path, configuration=places, telescope="ALMA", correlations="XX YY", fields=fields, spws=spws,
+                    scans=rounds * len(fields), scan_seconds=scan_seconds, integration=integration, sky=[(1.0, 0, 0)],
+                    spacing_seconds=hours * 3600 / (rounds * len(fields)), hour_angle=-hours / 2)
     edit(name + "/ANTENNA", "DISH_DIAMETER", lambda old: np.array(dishes))
     ends = np.asarray(dishes)[np.stack([column(name, "ANTENNA1"), column(name, "ANTENNA2")])]
     sigma = noise * (12.0 / ends[0]) * (12.0 / ends[1])
-    rng, made = np.random.default_rng(seed), predict(name, fields, sky, dishes)
+    rng, made = np.random.default_rng(seed), predict(name, fields, sky, dishes, fourier_sum)
     window, scan = column(name, "DATA_DESC_ID"), column(name, "SCAN_NUMBER")
     gains = 1 + gain_rms / np.sqrt(2) * (rng.standard_normal((scan.max() + 1, len(dishes)))
                                          + 1j * rng.standard_normal((scan.max() + 1, len(dishes))))

@@ -32,7 +32,7 @@ from casa_sara.imaging.data_quality import (
     thermal_noise,
 )
 from casa_sara.imaging.dry_run import forecast_run
-from casa_sara.imaging.mosaic import beam_weights, check_pointings, flat_noise, w_note, with_beams
+from casa_sara.imaging.mosaic import check_pointings, flat_noise, w_note, weight_image, with_beams
 from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
 from casa_sara.operators.measurement import Summed, check_cell, check_field
@@ -217,7 +217,7 @@ def _read(request):
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
     if grid.is_mosaic:
-        plane = plane.of_mosaic(_weight_image(data, grid, imaging_weights(data, grid, request.weighting, comm)), output.pblimit)
+        plane = plane.of_mosaic(weight_image(data, grid, imaging_weights(data, grid, request.weighting, comm)), output.pblimit)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
@@ -330,7 +330,7 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
     pixels = dict(psf=psf, residual=residual, model=model)
     if grid.is_mosaic:
-        pixels["weight"] = _weight_image(data, grid, weights)
+        pixels["weight"] = weight_image(data, grid, weights)
         pixels["residual"] = flat_noise(residual, pixels["weight"])
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too
         sumwt = float(weights.sum(dtype=float))
@@ -379,11 +379,6 @@ def _predicted(operator, data, grid, options, model, comm):
 def _operator(data, grid, options, comm):
     """Return the operator of the dirty images, for flat spectra."""
     return Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm, beam=data.beam), comm)
-
-
-def _weight_image(data, grid, weights):
-    """Return the weight of the data at each place of the sky, tclean's .weight of a mosaic, real (nx, ny)."""
-    return grid.mosaic.power(beam_weights(grid.mosaic, data.beam, weights)) / np.float32(weights.sum(dtype=float))
 
 
 def _point_spread(data, grid, weighting, options, plane, comm):

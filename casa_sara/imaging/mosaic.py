@@ -9,10 +9,10 @@ import numpy as np
 from casa_sara.casa.images.primary_beams import primary_beams
 from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, separation
 from casa_sara.casa.runtime import log
-from casa_sara.operators.mosaic import Beam, Mosaic, remaining_w_phase
-from casa_sara.parallel.serial import SERIAL
+from casa_sara.operators.beams import Beam, Mosaic
+from casa_sara.operators.mosaic import remaining_w_phase
 
-__all__ = ["beam_weights", "check_pointings", "flat_noise", "w_note", "with_beams"]
+__all__ = ["check_pointings", "flat_noise", "w_note", "weight_image", "with_beams"]
 
 SAME_POINTING = 1e-6  # rad, the least that fields may be apart
 SAME_BEAM = 0.01  # of the beam of a dish of 25 m, the largest that is common
@@ -46,9 +46,9 @@ def check_pointings(data, grid):
         return []
     apart = f"{len(directions)} fields, up to {spread * ARCSEC_PER_RAD:.1f} arcsec apart"
     if not grid.onepointing:
-        raise ValueError(f"gridder = '{grid.gridder}': {apart}, would be imaged as one pointing: should be gridder = 'mosaic', "
-                         "which models their primary beams, or one field, chosen with field. onepointing = True images them "
-                         "as one pointing nevertheless")
+        raise ValueError(f"gridder = '{grid.gridder}': {apart}, would be imaged as one pointing: should be gridder = "
+                         "'mosaic', which models their primary beams, or one field, chosen with field. onepointing = "
+                         "True images them as one pointing nevertheless")
     return [f"{apart}, are imaged as one pointing: their different primary beams are not modelled"]
 
 
@@ -81,10 +81,10 @@ def with_beams(data, selection, grid):
     if inside.any():
         mosaic = Mosaic(grid.shape, grid.cell_rad, tuple(one for one, seen in zip(beams, inside) if seen))
         data = _inside(replace(data, beam=beam), inside)
-        middle = mosaic.sensitivity(beam_weights(mosaic, data.beam, data.weight))[grid.shape[0] // 2, grid.shape[1] // 2]
-    if not inside.any() or not middle > 0:
-        raise ValueError(f"phasecenter = '{grid.phasecenter}': no pointing sees the centre of the image: should be a direction "
-                         "within the mosaic")
+        seen = mosaic.sensitivity(mosaic.sums(data.beam, data.weight))
+    if not inside.any() or not seen[grid.shape[0] // 2, grid.shape[1] // 2] > 0:
+        raise ValueError(f"phasecenter = '{grid.phasecenter}': no pointing sees the centre of the image: should be a "
+                         "direction within the mosaic")
     return data, replace(grid, mosaic=mosaic)
 
 
@@ -104,13 +104,25 @@ def w_note(data, mosaic, largest):
     phase = remaining_w_phase(data.max_w, mosaic)
     if phase <= largest:
         return []
-    return [f"the w-term is modelled to first order around each pointing: what is left out changes phases by up to {phase:.2g} "
-            "rad at the edges of the primary beams; there is no gridder yet that models both"]
+    return ["the w-term is modelled to first order around each pointing: what is left out changes phases by up to "
+            f"{phase:.2g} rad at the edges of the primary beams; gridder = 'wproject' models it, for single pointings"]
 
 
-def beam_weights(mosaic, beam_of_sample, weights, comm=SERIAL):
-    """Return the summed weight of the samples of each beam, float64 (B,), of all ranks."""
-    return comm.allreduce(np.bincount(beam_of_sample, weights, len(mosaic.beams)))
+def weight_image(data, grid, weights):
+    """Return Σ_g W_g A_g²/Σw, the weight of the data at each place of the sky, as tclean's .weight of a mosaic.
+
+    Parameters
+    ----------
+    data : casa_sara.data.visibilities.Visibilities
+    grid : casa_sara.options.ImageGrid
+    weights : real (M,)
+        w; W_g is their sum over the samples of beam g.
+
+    Returns
+    -------
+    float32 (nx, ny)
+    """
+    return grid.mosaic.power(grid.mosaic.sums(data.beam, weights)) / np.float32(weights.sum(dtype=float))
 
 
 def flat_noise(dirty, weight):

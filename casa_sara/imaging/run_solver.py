@@ -17,7 +17,7 @@ from casa_sara.casa.ms.weights import sampling_density
 from casa_sara.casa.runtime import log
 from casa_sara.data.visibilities import BlockInfo, Visibilities, clock
 from casa_sara.imaging.time_forecast import Pace
-from casa_sara.operators.mosaic import mosaic_density
+from casa_sara.operators.beams import mosaic_density
 from casa_sara.options import ImageGrid, Output, Selection, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial

@@ -1,9 +1,9 @@
 """Mosaics: what is solved for is the sky times the sensitivity, whose noise is the same everywhere.
 
-With S² = Σ_g W_g A_g²/Σ_g W_g (W_g the summed weight of the samples of beam g) the image x = S·I has a column of Φ/S of the
-same norm, Σ w, in every pixel, as the image of a single pointing has. All that the solver takes for granted of a
-single pointing (one noise level of the image, one response, steps that suit every pixel, ℓ1 weights by band) then holds for
-a mosaic too; of one pointing alone it is the same problem, the sky as the antennas see it.
+With S² = Σ_g W_g A_g²/Σ_g W_g (W_g the summed weight of the samples of beam g) every pixel of the image x = S·I has a
+column of Φ/S of the same norm, √(Σ w), as in an image of a single pointing. All that the solver takes for granted of a
+single pointing (one noise level of the image, one response, steps that suit every pixel, ℓ1 weights by band) then holds
+for a mosaic too; of one pointing alone it is the same problem, the sky as the antennas see it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class FlatNoise:
         """
         if grid.mosaic is None:
             return None
-        return cls(grid.mosaic.sensitivity(comm.allreduce(np.bincount(data.beam, data.weight, len(grid.mosaic.beams)))))
+        return cls(grid.mosaic.sensitivity(comm.allreduce(grid.mosaic.sums(data.beam, data.weight))))
 
     def grid(self, grid: ImageGrid) -> ImageGrid:
         """Return the image plane of x.
@@ -106,4 +106,5 @@ class FlatNoise:
         """
         largest = float(self.sensitivity.max())
         sky = np.divide(found.model, self.sensitivity, out=np.zeros_like(found.model), where=self.sensitivity > 0)
-        return replace(found, model=sky, noise_jy_per_beam=found.noise_jy_per_beam / largest, threshold=found.threshold / largest)
+        return replace(found, model=sky, noise_jy_per_beam=found.noise_jy_per_beam / largest,
+                       threshold=found.threshold / largest)

@@ -1,9 +1,9 @@
 """The primary beams of the pointings of a mosaic, by field, dishes and frequency.
 
-Of ALMA and the ACA they are those of CASA's mosaic gridder: the Airy pattern of a dish of 10.7 m (of 12 m) or 6.25 m (of 7 m)
-with a blockage of 0.75 m, and on a baseline of unlike dishes the product of the two voltage patterns. They end at the first
-null. Of other telescopes, whose dishes must all be the same, they are CASA's .pb of the standard gridder. They are centred on
-PHASE_DIR of FIELD, as with usepointing=False in tclean; POINTING is not read.
+Of ALMA and the ACA they are those of CASA's mosaic gridder: the Airy pattern of a dish of 10.7 m (of 12 m) or 6.25 m
+(of 7 m) with a blockage of 0.75 m, and on a baseline of unlike dishes the product of the two voltage patterns. They end
+at the first null. Of other telescopes, whose dishes must all be the same, they are CASA's .pb of the standard gridder.
+They are centred on PHASE_DIR of FIELD, as with usepointing=False in tclean; POINTING is not read.
 """
 
 from __future__ import annotations
@@ -79,12 +79,12 @@ def primary_beams(data, selection, grid):
 def _words(pointings, dishes, pairs, bands):
     """Say what beams there are."""
     kinds = ", ".join(" with ".join(f"{dishes[k][1]:g} m" for k in pair) for pair in pairs)
-    return (f"mosaic of {pointings} pointings: their primary beams are centred on PHASE_DIR of FIELD, POINTING is not used; "
-            f"baselines of dishes of {kinds}; beams at {', '.join(f'{band / 1e9:.5g}' for band in bands)} GHz")
+    return (f"mosaic of {pointings} pointings: their primary beams are centred on PHASE_DIR of FIELD, POINTING is not "
+            f"used; baselines of dishes of {kinds}; beams at {', '.join(f'{band / 1e9:.5g}' for band in bands)} GHz")
 
 
 def _pointings(data, grid):
-    """Return the pixels (P, 2) of the distinct directions of the fields, and the number of that of each row, int (R,)."""
+    """Return the pixels (P, 2) of the distinct directions of fields, and the number of that of each row, int (R,)."""
     rows, centre = data.rows, data.phase_center
     _check_fields(data)
     number = rows.ms.astype(np.int64) * (int(rows.field.max()) + 1) + rows.field
@@ -110,12 +110,12 @@ def _check_fields(data):
         with opened("msmetadata", readable(name)) as md:
             frame = md.phasecenter(field)["refer"]
         if is_of_earth({"refer": frame}):
-            raise ValueError(f"gridder = 'mosaic': field {field} of '{name}' is in {frame}, and moves on the sky: mosaics take "
-                             "fields in J2000 and the like; choose them with field")
+            raise ValueError(f"gridder = 'mosaic': field {field} of '{name}' is in {frame}, and moves on the sky: "
+                             "mosaics take fields in J2000 and the like; choose them with field")
 
 
 def _dishes(data):
-    """Return the kinds of dishes, (telescope, diameter in m), and those at both ends of the baseline of each row, int (2, R)."""
+    """Return the kinds of dishes, (telescope, diameter in m), and those of the baseline of each row, int (2, R)."""
     rows, kinds, of_row = data.rows, [], np.empty((2, data.rows.ms.size), int)
     for number in np.unique(rows.ms):
         name, here = data.ms_names[number], rows.ms == number
@@ -123,12 +123,11 @@ def _dishes(data):
             diameters = tb.getcol("DISH_DIAMETER")
         telescopes = set(texts(name, "OBSERVATION", "TELESCOPE_NAME"))
         telescope = "ALMA" if telescopes <= OF_ALMA else ", ".join(sorted(telescopes))
-        ends = np.stack([rows.antenna1[here], rows.antenna2[here]])
-        for diameter in np.unique(diameters[np.unique(ends)]):
-            if (telescope, float(diameter)) not in kinds:
-                kinds.append((telescope, float(diameter)))
-        kind_of = np.array([kinds.index((telescope, float(d))) if (telescope, float(d)) in kinds else 0 for d in diameters])
-        of_row[:, here] = kind_of[ends]
+        ends = diameters[np.stack([rows.antenna1[here], rows.antenna2[here]])]
+        for diameter in np.unique(ends).tolist():
+            if (telescope, diameter) not in kinds:
+                kinds.append((telescope, diameter))
+            of_row[:, here] = np.where(ends == diameter, kinds.index((telescope, diameter)), of_row[:, here])
     _check_dishes(kinds)
     return kinds, of_row
 
@@ -138,15 +137,16 @@ def _check_dishes(kinds):
     wrong = [diameter for telescope, diameter in kinds if telescope == "ALMA" and diameter not in AIRY]
     if wrong:
         raise ValueError(f"gridder = 'mosaic': ALMA's dishes have {' or '.join(f'{size:g}' for size in AIRY)} m in "
-                         f"ANTENNA/DISH_DIAMETER, not {', '.join(f'{size:g}' for size in wrong)} m: correct it, or image with "
-                         "gridder = 'standard'")
+                         f"ANTENNA/DISH_DIAMETER, not {', '.join(f'{size:g}' for size in wrong)} m: correct it, or "
+                         "image with gridder = 'standard'")
     if len(kinds) > 1 and any(telescope != "ALMA" for telescope, _ in kinds):
-        raise ValueError("gridder = 'mosaic': unlike dishes (" + ", ".join(f"{telescope}, {size:g} m" for telescope, size in kinds)
-                         + ") can be imaged together for ALMA and the ACA only: image them separately, or with gridder = 'standard'")
+        named = ", ".join(f"{telescope}, {size:g} m" for telescope, size in kinds)
+        raise ValueError(f"gridder = 'mosaic': unlike dishes ({named}) can be imaged together for ALMA and the ACA "
+                         "only: image them separately, or with gridder = 'standard'")
 
 
 def _bands(freq_hz, weight):
-    """Return the mean frequencies of groups of neighbouring ones, float (F,), and the group of each sample, int (M,)."""
+    """Return the mean frequencies of groups of similar ones, float (F,), and the group of each sample, int (M,)."""
     distinct, of_sample = np.unique(np.asarray(freq_hz, float), return_inverse=True)
     group, start = np.zeros(distinct.size, int), distinct[0]
     for k in range(1, distinct.size):
@@ -190,11 +190,12 @@ def _of_casa(data, selection, grid, dish, freq_hz):
     wavelength = SPEED_OF_LIGHT / freq_hz
     cell = TABLE_WIDTH * wavelength / max(dish[1], 1.0) / TABLE_PIXELS
     centre = data.fields[min(data.fields)]
-    around = replace(grid, shape=(TABLE_PIXELS, TABLE_PIXELS), cell_rad=(cell, cell), phasecenter="", reffreq=f"{float(freq_hz)!r}Hz")
+    around = replace(grid, shape=(TABLE_PIXELS, TABLE_PIXELS), cell_rad=(cell, cell), phasecenter="",
+                     reffreq=f"{float(freq_hz)!r}Hz")
     plane = define_image_plane(replace(data, phase_center=centre), selection, around, pblimit=FAINTEST)
     if plane.notes:
-        raise ValueError(f"gridder = 'mosaic': CASA has no primary beam of the telescope '{dish[0]}': image with gridder = "
-                         "'standard'")
+        raise ValueError(f"gridder = 'mosaic': CASA has no primary beam of the telescope '{dish[0]}': image with "
+                         "gridder = 'standard'")
     half = TABLE_PIXELS // 2
     along = plane.pb[half:, half].astype(float)
     faint = np.flatnonzero((along < FAINTEST) | np.append(np.diff(along) > 0, True))  # to its end, or its first minimum
