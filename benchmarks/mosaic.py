@@ -7,8 +7,8 @@
 The visibilities are type-3 non-uniform transforms, exact with w, of a sky on pixels a third as large as those of the
 image, for each pair of dishes through the product of their Airy patterns (to their first nulls). tclean runs
 gridder='mosaic' with multiscale; the best of GRID at half a beam is shown. SNR = 20 log10(‖truth‖/‖truth − model‖) of
-the sky smoothed to a half and to one beam of tclean, where the primary beam is above 0.3. tclean's model is divided by the
-primary beam.
+the sky smoothed to a half and to one beam of tclean, where the primary beam is above 0.3. tclean's model is divided by
+the primary beam.
 """
 
 from __future__ import annotations
@@ -153,7 +153,7 @@ def compare(folder, scene):
     seconds = time.perf_counter() - begin
     model, pb = read_image(root + ".model")[0], read_image(root + ".pb")[0]
     residual = float(read_image(root + ".residual")[0][pb > LEAST].std())
-    print(f"{scene}: {made['sara']['visibilities']} visibilities, {made['iterdone']} iterations, {made['stopDescription']}")
+    print(f"{scene}: {made['sara']['visibilities']} samples, {made['iterdone']} iterations, {made['stopDescription']}")
     print("| imager | SNR at half a beam, dB | at one beam | flux / true | residual, mJy/beam | s |")
     print("|---|---|---|---|---|---|")
     for label, scores, beam, clean_s, clean_residual in best.values():
