@@ -141,15 +141,15 @@ def test_density_counts_what_overlaps():
     together = mosaic_density(np.tile(uvw, 2), np.repeat([0, 1], 4), np.tile(weight, 2), same)
     np.testing.assert_allclose(together, np.tile([14, 14, 14, 16], 2), rtol=1e-5)
     # in part: as much as the rows of the flat operator have in common
-    partly = Mosaic(SHAPE, CELL, (BEAMS[0], BEAMS[2]))
-    first, second = attenuation(BEAMS[0]), attenuation(BEAMS[2])
+    partly = Mosaic(SHAPE, CELL, BEAMS[:2])
+    first, second = map(attenuation, BEAMS[:2])
     power = (first**2 + second**2) / 2
     inner, outer = (float((one * other)[power > 0] @ (1 / power[power > 0])) for one, other in (
         (first, first), (first, second)))
     mean = np.array([inner, outer]) / np.count_nonzero(power)
     uvw, weight = np.zeros((3, 4)), np.array([1.0, 2.0, 4.0, 8.0])
     found = mosaic_density(uvw, np.array([0, 0, 1, 1]), weight / [3, 3, 12, 12], partly)
-    assert 0.1 < mean[1] < 0.5 * mean[0]
+    assert 0.2 < mean[1] < 0.9 * mean[0]
     np.testing.assert_allclose(found[0], mean.sum(), rtol=0.02)
 
 
