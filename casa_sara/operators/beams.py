@@ -13,7 +13,7 @@ from casa_sara.runtime import jit
 
 __all__ = ["Beam", "Mosaic", "beam_at", "mosaic_density"]
 
-LEAST = 0.05  # of the largest sensitivity, that of the mosaic where it ends
+LEAST = 0.1  # of the largest sensitivity, that of the mosaic where it ends
 COARSE = 128  # pixels along an image in which the overlap of beams is summed
 
 

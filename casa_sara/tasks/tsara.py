@@ -261,7 +261,7 @@ class _tsara:
         same noise everywhere, as tclean's with normtype='flatnoise'; .image.pbcor and .model.pbcor are the
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
-        The model is zero where .pb is below 0.05. Not available with 'mosaic': specmode='cube',
+        The model is zero where .pb is below 0.1. Not available with 'mosaic': specmode='cube',
         parallel=True, savemodel, report and saracompare.
 
     onepointing : bool, default False
