@@ -196,17 +196,18 @@ def test_beams_are_the_products_of_airy_patterns(folder):
     name = simulate_mosaic(folder / "bands.ms", HEXAGON[:3], [(1.0, 0, 0)], dishes=(12.0, 12.0, 7.0, 7.0), spws=spws)
     grid = ImageGrid((200, 180), (ARCSEC, ARCSEC), AT_CENTRE, gridder="mosaic")
     data = read_visibilities(Selection((name,), datacolumn="data"), AT_CENTRE, frequencies=True)
-    centres, profiles, beams, of_sample, words = primary_beams(data, Selection((name,)), grid)
-    assert len(centres) == 3 and len(profiles) == 6 and len(beams) == 18  # the first two windows within 2 %
-    assert "3 pointings" in words and "POINTING is not used" in words and "7 m with 7 m" in words
-    np.testing.assert_allclose(centres, [[100 - x, 90 + y] for x, y in HEXAGON[:3]], atol=1e-4)
+    found = primary_beams(data, Selection((name,)), grid)
+    profiles, beams, of_sample = found.profiles, found.beams, found.beam_of_sample
+    assert len(profiles.kinds) == 6 and len(beams) == 18  # the first two windows are within 2 %
+    assert all(words in found.words for words in ("3 pointings", "POINTING is not used", "7 m with 7 m"))
+    np.testing.assert_allclose(found.centres, [[100 - x, 90 + y] for x, y in HEXAGON[:3]], atol=1e-4)
     diameters = np.array([12.0, 12.0, 7.0, 7.0])
     rows = data.rows
     for k in range(0, data.size, 7):
         row = data.row[k]
         pointing, number = beams[of_sample[k]]
         assert pointing == rows.field[row]
-        radius, values = profiles[number]
+        radius, values = profiles.radii[number], profiles.values[number]
         pair = diameters[[rows.antenna1[row], rows.antenna2[row]]]
         freq = data.freq_hz[k] if data.freq_hz[k] > 105e9 else data.freq_hz[data.freq_hz < 105e9].astype(float).mean()
         distance = radius * np.sqrt(np.linspace(0, 1, values.size))

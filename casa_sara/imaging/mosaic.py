@@ -11,8 +11,9 @@ from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, separation
 from casa_sara.casa.runtime import log
 from casa_sara.operators.beams import Beam, Mosaic
 from casa_sara.operators.mosaic import remaining_w_phase
+from casa_sara.operators.sky import sky_operator
 
-__all__ = ["check_pointings", "flat_noise", "w_note", "weight_image", "with_beams"]
+__all__ = ["MosaicModel", "check_pointings", "flat_noise", "w_note", "weight_image", "with_beams"]
 
 SAME_POINTING = 1e-6  # rad, the least that fields may be apart
 SAME_BEAM = 0.01  # of the beam of a dish of 25 m, the largest that is common
@@ -74,29 +75,79 @@ def with_beams(data, selection, grid):
     ValueError
         The beams are not known, or no pointing sees the centre of the image.
     """
-    centres, profiles, pairs, beam, words = primary_beams(data, selection, grid)
-    log.info(words)
-    beams = [Beam((float(centres[p, 0]), float(centres[p, 1])), *profiles[k]) for p, k in pairs]
-    inside = np.array([all(part.stop > part.start for part in one.box(grid.shape, grid.cell_rad)) for one in beams])
-    if inside.any():
-        mosaic = Mosaic(grid.shape, grid.cell_rad, tuple(one for one, seen in zip(beams, inside) if seen))
-        data = _inside(replace(data, beam=beam), inside)
-        seen = mosaic.sensitivity(mosaic.sums(data.beam, data.weight))
-    if not inside.any() or not seen[grid.shape[0] // 2, grid.shape[1] // 2] > 0:
+    found = primary_beams(data, selection, grid)
+    log.info(found.words)
+    mosaic, beam = _mosaic(found, grid)
+    data = replace(data, beam=beam)
+    kept = np.flatnonzero(beam >= 0)
+    if kept.size < data.size:
+        beyond = data.size - kept.size
+        note = f"{beyond} visibilities are of pointings that see nothing of the image, and are left out"
+        data = replace(data.part(kept), dropped=data.dropped | {"beyond the image": beyond}, notes=[*data.notes, note])
+    seen = mosaic.sensitivity(mosaic.sums(data.beam, data.weight)) if data.size else np.zeros(grid.shape)
+    if not seen[grid.shape[0] // 2, grid.shape[1] // 2] > 0:
         raise ValueError(f"phasecenter = '{grid.phasecenter}': no pointing sees the centre of the image: should be a "
                          "direction within the mosaic")
-    return data, replace(grid, mosaic=mosaic)
+    return data, replace(grid, mosaic=replace(mosaic, profiles=found.profiles))
 
 
-def _inside(data, inside):
-    """Return the samples whose beam is in the image, with the beams numbered anew, and say how many are not."""
-    data.beam = (np.cumsum(inside) - 1).astype(np.int32)[data.beam] + np.where(inside[data.beam], 0, -len(inside))
-    kept = np.flatnonzero(data.beam >= 0)
-    beyond = data.size - kept.size
-    if not beyond:
-        return data
-    note = f"{beyond} visibilities are of pointings that see nothing of the image, and are left out"
-    return replace(data.part(kept), dropped=data.dropped | {"beyond the image": beyond}, notes=[*data.notes, note])
+def _mosaic(found, grid):
+    """Return the `Mosaic` of those beams that are in the image, and the number of that of each sample, else -1, int32 (M,)."""
+    profiles = found.profiles
+    beams = [Beam((float(found.centres[p, 0]), float(found.centres[p, 1])), float(profiles.radii[k]), profiles.values[k])
+             for p, k in found.beams]
+    inside = np.array([all(part.stop > part.start for part in one.box(grid.shape, grid.cell_rad)) for one in beams])
+    number = np.where(inside, np.cumsum(inside) - 1, -1).astype(np.int32)
+    mosaic = Mosaic(grid.shape, grid.cell_rad, tuple(one for one, seen in zip(beams, inside) if seen))
+    return mosaic, number[found.beam_of_sample]
+
+
+class MosaicModel:
+    """Predicts the visibilities of a sky for rows of MeasurementSets, used or not.
+
+    Parameters
+    ----------
+    model : real (nx, ny)
+        Jy/pixel.
+    grid : casa_sara.options.ImageGrid
+        Its `spectrum` is used.
+    selection : casa_sara.options.Selection
+    known : casa_sara.data.visibilities.Visibilities
+        What the beams need to know of the data: `phase_center`, `fields` and `ms_names`.
+    profiles : casa_sara.casa.images.primary_beams.Profiles
+        Those that the model was made with.
+    accuracy : float
+    nthreads : int
+    """
+
+    def __init__(self, model, grid, selection, known, profiles, accuracy, nthreads):
+        self._model, self._grid, self._selection, self._known = model, grid, selection, known
+        self._profiles, self._options = profiles, dict(eps=accuracy, nthreads=nthreads)
+
+    def __call__(self, uvw, freq_hz, rows):
+        """Return the visibilities, complex (M,), at the phase centre of the image.
+
+        Parameters
+        ----------
+        uvw : float64 (3, M)
+            Wavelengths.
+        freq_hz : float64 (M,)
+        rows : casa_sara.data.visibilities.RowTable
+            Of R rows, of M/R channels each.
+        """
+        count = uvw.shape[1]
+        vis = np.zeros(count, np.complex64)
+        if not count:
+            return vis
+        row = np.repeat(np.arange(rows.ms.size), count // rows.ms.size)
+        data = replace(self._known, vis=vis, weight=np.ones(count, np.float32), uvw=uvw, row=row, rows=rows, freq_hz=freq_hz)
+        mosaic, beam = _mosaic(primary_beams(data, self._selection, self._grid, self._profiles), self._grid)
+        seen = np.flatnonzero(beam >= 0)
+        if seen.size:
+            operator = sky_operator(uvw[:, seen], replace(self._grid, mosaic=mosaic), freq_hz[seen], beam=beam[seen],
+                                    **self._options)
+            vis[seen] = operator.forward(self._model)
+        return vis
 
 
 def w_note(data, mosaic, largest):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -92,12 +93,15 @@ class Mosaic:
     beams : tuple of Beam
     over : float32 (nx, ny), optional
         The sky is the image times this (:meth:`flat`); without it, the image is the sky.
+    profiles : object, optional
+        What the beams of more samples of the same data are made of.
     """
 
     shape: tuple[int, int]
     cell_rad: tuple[float, float]
     beams: tuple[Beam, ...]
     over: np.ndarray | None = None
+    profiles: Any = None
 
     def sums(self, beam_of_sample: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Return the summed weight of the samples of each beam, float64 (number of beams,).

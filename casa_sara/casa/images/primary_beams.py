@@ -9,7 +9,7 @@ They are centred on PHASE_DIR of FIELD, as with usepointing=False in tclean; POI
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import j1
@@ -19,7 +19,7 @@ from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, is_of_earth, rotation_betwe
 from casa_sara.casa.ms.subtables import readable, texts
 from casa_sara.casa.runtime.tools import opened
 
-__all__ = ["primary_beams"]
+__all__ = ["PrimaryBeams", "Profiles", "primary_beams"]
 
 AIRY = {12.0: (10.7, 0.75), 7.0: (6.25, 0.75)}  # diameter → effective diameter and blockage, m, of ALMA and the ACA
 OF_ALMA = {"ALMA", "ACA"}
@@ -31,62 +31,105 @@ TABLE_PIXELS, TABLE_WIDTH = 1024, 3.0  # of the image in which CASA makes a beam
 FAINTEST = 1e-3  # where CASA's beam ends
 
 
-def primary_beams(data, selection, grid):
+@dataclass(frozen=True)
+class Profiles:
+    """How the beams of a mosaic fall off, by dishes and frequency.
+
+    Attributes
+    ----------
+    bands_hz : float64 (F,)
+        The frequencies that samples are assigned to, the nearest.
+    kinds : list of (str, float, float, int)
+        Telescope, diameters of both dishes in m, the larger first, and number of the frequency.
+    radii : float64 (n,)
+        Where A ends, in direction cosines.
+    values : float32 (n, K)
+        A along the square of the distance, as of :class:`casa_sara.operators.beams.Beam`.
+    """
+
+    bands_hz: np.ndarray
+    kinds: list[tuple[str, float, float, int]]
+    radii: np.ndarray
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class PrimaryBeams:
+    """The primary beam of every sample.
+
+    Attributes
+    ----------
+    centres : float64 (P, 2)
+        Pixels of the pointings, counted from 0.
+    profiles : Profiles
+    beams : int (B, 2)
+        Pointing and profile of each beam.
+    beam_of_sample : int32 (M,)
+    """
+
+    centres: np.ndarray
+    profiles: Profiles
+    beams: np.ndarray
+    beam_of_sample: np.ndarray
+
+    @property
+    def words(self) -> str:
+        """What they are, for the log."""
+        pairs = sorted({(telescope, *diameters) for telescope, *diameters, _ in self.profiles.kinds})
+        dishes = ", ".join(f"{one:g} m with {other:g} m" for _, one, other in pairs)
+        bands = ", ".join(f"{band / 1e9:.5g}" for band in self.profiles.bands_hz)
+        return (f"mosaic of {len(self.centres)} pointings: their primary beams are centred on PHASE_DIR of FIELD, POINTING is "
+                f"not used; baselines of dishes of {dishes}; beams at {bands} GHz")
+
+
+def primary_beams(data, selection, grid, profiles=None):
     """Find the primary beam of every sample.
 
     Parameters
     ----------
     data : casa_sara.data.visibilities.Visibilities
-        With `freq_hz` and `fields`.
+        With `freq_hz` and `fields`; `weight`, `uvw` and what says where samples come from is used.
     selection : casa_sara.options.Selection
     grid : casa_sara.options.ImageGrid
+    profiles : Profiles, optional
+        That were found before, of other samples of the same data.
 
     Returns
     -------
-    centres : float64 (P, 2)
-        Pixels of the pointings, counted from 0.
-    profiles : list of (float, float32 (K,))
-        Radius in rad and A along the square of the distance, of each pair of dishes and frequency.
-    beams : int (B, 2)
-        Pointing and profile of each beam.
-    beam_of_sample : int32 (M,)
-    words : str
-        What they are, for the log.
+    PrimaryBeams
 
     Raises
     ------
     ValueError
         A field moves on the sky, or CASA has no beam of these dishes.
     """
-    rows = data.rows
     centres, pointing_of_row = _pointings(data, grid)
     dishes, dish_of_row = _dishes(data)
-    # pairs of dishes, the larger number first
-    pair = np.sort(dish_of_row, axis=0)
-    pair_of_row = pair[1] * len(dishes) + pair[0]
-    bands, band_of_sample = _bands(data.freq_hz, data.weight)
-    key = np.stack([pointing_of_row[data.row], pair_of_row[data.row], band_of_sample])
-    combined = np.ravel_multi_index(key, [int(numbers.max()) + 1 for numbers in key])
-    used, first, beam_of_sample = np.unique(combined, return_index=True, return_inverse=True)
-    kinds, profile_of_beam = np.unique(key[1:, first], axis=1, return_inverse=True)
-    profiles = [_profile(data, selection, grid, [dishes[k] for k in divmod(int(number), len(dishes))], bands[band])
-                for number, band in kinds.T]
-    beams = np.stack([key[0, first], profile_of_beam.ravel()], axis=1)
-    pairs = [divmod(int(number), len(dishes)) for number in np.unique(kinds[0])]
-    return centres, profiles, beams, beam_of_sample.ravel().astype(np.int32), _words(len(centres), dishes, pairs, bands)
+    if profiles is None:
+        _check_fields(data)
+        profiles = Profiles(_bands(data.freq_hz, data.weight), [], np.zeros(0), np.zeros((0, PROFILE), np.float32))
+    band = np.abs(np.log(np.asarray(data.freq_hz, float)[:, None] / profiles.bands_hz)).argmin(axis=1)
+    smaller, larger = np.sort(dish_of_row, axis=0)[:, data.row]
+    key = np.stack([pointing_of_row[data.row], larger, smaller, band])
+    beams, beam_of_sample = np.unique(key, axis=1, return_inverse=True)
+    wanted = [(dishes[k][0], dishes[k][1], dishes[n][1], int(number)) for _, k, n, number in beams.T.tolist()]
+    profiles = _with_kinds(profiles, sorted(set(wanted)), data, selection, grid)
+    beams = np.stack([beams[0], [profiles.kinds.index(kind) for kind in wanted]], axis=1)
+    return PrimaryBeams(centres, profiles, beams, beam_of_sample.ravel().astype(np.int32))
 
 
-def _words(pointings, dishes, pairs, bands):
-    """Say what beams there are."""
-    kinds = ", ".join(" with ".join(f"{dishes[k][1]:g} m" for k in pair) for pair in pairs)
-    return (f"mosaic of {pointings} pointings: their primary beams are centred on PHASE_DIR of FIELD, POINTING is not "
-            f"used; baselines of dishes of {kinds}; beams at {', '.join(f'{band / 1e9:.5g}' for band in bands)} GHz")
+def _with_kinds(profiles, kinds, data, selection, grid):
+    """Return the profiles with those of these kinds."""
+    new = [kind for kind in kinds if kind not in profiles.kinds]
+    made = [_profile(data, selection, grid, kind[0], kind[1:3], profiles.bands_hz[kind[3]]) for kind in new]
+    radii, values = [radius for radius, _ in made], [one for _, one in made]
+    return replace(profiles, kinds=profiles.kinds + new, radii=np.append(profiles.radii, radii),
+                   values=np.concatenate([profiles.values, np.reshape(values, (-1, PROFILE)).astype(np.float32)]))
 
 
 def _pointings(data, grid):
     """Return the pixels (P, 2) of the distinct directions of fields, and the number of that of each row, int (R,)."""
     rows, centre = data.rows, data.phase_center
-    _check_fields(data)
     number = rows.ms.astype(np.int64) * (int(rows.field.max()) + 1) + rows.field
     fields, first, of_row = np.unique(number, return_index=True, return_inverse=True)
     cosines = []
@@ -146,7 +189,7 @@ def _check_dishes(kinds):
 
 
 def _bands(freq_hz, weight):
-    """Return the mean frequencies of groups of similar ones, float (F,), and the group of each sample, int (M,)."""
+    """Return the mean frequencies of groups of similar ones, float64 (F,)."""
     distinct, of_sample = np.unique(np.asarray(freq_hz, float), return_inverse=True)
     group, start = np.zeros(distinct.size, int), distinct[0]
     for k in range(1, distinct.size):
@@ -155,18 +198,18 @@ def _bands(freq_hz, weight):
         start = distinct[k] if new else start
     of_sample = group[of_sample.ravel()]
     sums = np.bincount(of_sample, weight)
-    return np.bincount(of_sample, weight * np.asarray(freq_hz, float)) / sums, of_sample
+    return np.bincount(of_sample, weight * np.asarray(freq_hz, float)) / sums
 
 
-def _profile(data, selection, grid, dishes, freq_hz):
+def _profile(data, selection, grid, telescope, diameters, freq_hz):
     """Return the radius in rad of a beam, and A along the square of the distance."""
-    if dishes[0][0] == "ALMA":
-        patterns = [AIRY[diameter] for _, diameter in dishes]
+    if telescope == "ALMA":
+        patterns = [AIRY[diameter] for diameter in diameters]
         radius = min(_null(*pattern) for pattern in patterns) * SPEED_OF_LIGHT / freq_hz
         distance = radius * np.sqrt(np.linspace(0, 1, PROFILE))
         beam = np.prod([_voltage(distance * freq_hz / SPEED_OF_LIGHT, *pattern) for pattern in patterns], axis=0)
         return radius, np.maximum(beam, 0).astype(np.float32)
-    return _of_casa(data, selection, grid, dishes[0], freq_hz)
+    return _of_casa(data, selection, grid, telescope, diameters[0], freq_hz)
 
 
 def _voltage(place, diameter, blockage):
@@ -185,16 +228,16 @@ def _null(diameter, blockage):
     return float(np.interp(0, -_voltage(place, diameter, blockage), place))
 
 
-def _of_casa(data, selection, grid, dish, freq_hz):
+def _of_casa(data, selection, grid, telescope, diameter, freq_hz):
     """The same of another telescope, from CASA's image of its beam at one frequency, around the centre of a field."""
     wavelength = SPEED_OF_LIGHT / freq_hz
-    cell = TABLE_WIDTH * wavelength / max(dish[1], 1.0) / TABLE_PIXELS
+    cell = TABLE_WIDTH * wavelength / max(diameter, 1.0) / TABLE_PIXELS
     centre = data.fields[min(data.fields)]
     around = replace(grid, shape=(TABLE_PIXELS, TABLE_PIXELS), cell_rad=(cell, cell), phasecenter="",
                      reffreq=f"{float(freq_hz)!r}Hz")
     plane = define_image_plane(replace(data, phase_center=centre), selection, around, pblimit=FAINTEST)
     if plane.notes:
-        raise ValueError(f"gridder = 'mosaic': CASA has no primary beam of the telescope '{dish[0]}': image with "
+        raise ValueError(f"gridder = 'mosaic': CASA has no primary beam of the telescope '{telescope}': image with "
                          "gridder = 'standard'")
     half = TABLE_PIXELS // 2
     along = plane.pb[half:, half].astype(float)
