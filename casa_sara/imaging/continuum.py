@@ -32,7 +32,15 @@ from casa_sara.imaging.data_quality import (
     thermal_noise,
 )
 from casa_sara.imaging.dry_run import forecast_run
-from casa_sara.imaging.mosaic import check_pointings, flat_noise, w_note, weight_image, with_beams
+from casa_sara.imaging.mosaic import (
+    MosaicModel,
+    beams_record,
+    check_pointings,
+    flat_noise,
+    w_note,
+    weight_image,
+    with_beams,
+)
 from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
 from casa_sara.operators.measurement import Summed, check_cell, check_field
@@ -351,15 +359,20 @@ def _save_model(selection, data, grid, options, model):
     log.info("writing MODEL_DATA")
     save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
                       cell_rad=grid.cell_rad, gridder=grid.gridder, spectrum=grid.spectrum and asdict(grid.spectrum),
-                      nthreads=options.nthreads, model=model)
+                      nthreads=options.nthreads, model=model, beams=beams_record(data, grid) if grid.is_mosaic else None)
 
 
-def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads, model):
+def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads, model, beams=None):
     """Predict the visibilities of a model and write them: what `save_model_column` has a child process do."""
-    chosen = {name: tuple(value) if isinstance(value, list) else value for name, value in selection.items()}
+    selection = Selection(**{name: tuple(value) if isinstance(value, list) else value for name, value in selection.items()})
     grid = ImageGrid(model.shape, tuple(cell_rad), gridder=gridder, spectrum=spectrum and Spectrum(**spectrum))
-    write_model_column(Selection(**chosen), phase_center, lambda uvw, freq_hz: sky_operator(
-        uvw, grid, freq_hz, eps=IMAGE_EPS, nthreads=nthreads).forward(model))
+    accuracy = dict(eps=IMAGE_EPS, nthreads=nthreads)
+    if beams is not None:
+        predict = MosaicModel(model, grid, selection, phase_center, beams, accuracy)
+        write_model_column(selection, phase_center, predict, by_row=True)
+        return
+    write_model_column(selection, phase_center,
+                       lambda uvw, freq_hz: sky_operator(uvw, grid, freq_hz, **accuracy).forward(model))
 
 
 def _peak(name):

@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from casa_sara.casa.images.primary_beams import primary_beams
+from casa_sara.casa.images.primary_beams import Profiles, primary_beams
 from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, separation
 from casa_sara.casa.runtime import log
+from casa_sara.data.visibilities import Visibilities
 from casa_sara.operators.beams import Beam, Mosaic
 from casa_sara.operators.mosaic import remaining_w_phase
 from casa_sara.operators.sky import sky_operator
 
-__all__ = ["MosaicModel", "check_pointings", "flat_noise", "w_note", "weight_image", "with_beams"]
+__all__ = ["MosaicModel", "beams_record", "check_pointings", "flat_noise", "w_note", "weight_image", "with_beams"]
 
 SAME_POINTING = 1e-6  # rad, the least that fields may be apart
 SAME_BEAM = 0.01  # of the beam of a dish of 25 m, the largest that is common
@@ -92,14 +93,31 @@ def with_beams(data, selection, grid):
 
 
 def _mosaic(found, grid):
-    """Return the `Mosaic` of those beams that are in the image, and the number of that of each sample, else -1, int32 (M,)."""
+    """Return the `Mosaic` of the beams that are in the image, and the number of that of each sample or -1, int32 (M,)."""
     profiles = found.profiles
-    beams = [Beam((float(found.centres[p, 0]), float(found.centres[p, 1])), float(profiles.radii[k]), profiles.values[k])
-             for p, k in found.beams]
+    centres = [tuple(centre) for centre in found.centres.tolist()]
+    beams = [Beam(centres[p], float(profiles.radii[k]), profiles.values[k]) for p, k in found.beams]
     inside = np.array([all(part.stop > part.start for part in one.box(grid.shape, grid.cell_rad)) for one in beams])
     number = np.where(inside, np.cumsum(inside) - 1, -1).astype(np.int32)
     mosaic = Mosaic(grid.shape, grid.cell_rad, tuple(one for one, seen in zip(beams, inside) if seen))
     return mosaic, number[found.beam_of_sample]
+
+
+def beams_record(data, grid):
+    """Return, as plain values and arrays, what :class:`MosaicModel` takes for the beams of these data.
+
+    Parameters
+    ----------
+    data : casa_sara.data.visibilities.Visibilities
+    grid : casa_sara.options.ImageGrid
+        With its mosaic.
+
+    Returns
+    -------
+    dict
+    """
+    fields = [[*key, direction] for key, direction in data.fields.items()]
+    return dict(fields=fields, **vars(grid.mosaic.profiles))
 
 
 class MosaicModel:
@@ -112,17 +130,20 @@ class MosaicModel:
     grid : casa_sara.options.ImageGrid
         Its `spectrum` is used.
     selection : casa_sara.options.Selection
-    known : casa_sara.data.visibilities.Visibilities
-        What the beams need to know of the data: `phase_center`, `fields` and `ms_names`.
-    profiles : casa_sara.casa.images.primary_beams.Profiles
-        Those that the model was made with.
-    accuracy : float
-    nthreads : int
+    phase_center : dict
+        Direction of the image centre.
+    beams : dict
+        Of :func:`beams_record`, as it comes out of JSON.
+    accuracy : dict
+        `eps` and `nthreads` of the operator.
     """
 
-    def __init__(self, model, grid, selection, known, profiles, accuracy, nthreads):
-        self._model, self._grid, self._selection, self._known = model, grid, selection, known
-        self._profiles, self._options = profiles, dict(eps=accuracy, nthreads=nthreads)
+    def __init__(self, model, grid, selection, phase_center, beams, accuracy):
+        self._model, self._grid, self._selection, self._accuracy = model, grid, selection, accuracy
+        fields = {(int(ms), int(field)): direction for ms, field, direction in beams["fields"]}
+        self._profiles = Profiles(np.asarray(beams["bands_hz"]), [tuple(kind) for kind in beams["kinds"]],
+                                  np.asarray(beams["radii"]), np.asarray(beams["values"]))
+        self._where = dict(imaging_weight=None, chan=None, ms_names=selection.vis, phase_center=phase_center, fields=fields)
 
     def __call__(self, uvw, freq_hz, rows):
         """Return the visibilities, complex (M,), at the phase centre of the image.
@@ -140,12 +161,12 @@ class MosaicModel:
         if not count:
             return vis
         row = np.repeat(np.arange(rows.ms.size), count // rows.ms.size)
-        data = replace(self._known, vis=vis, weight=np.ones(count, np.float32), uvw=uvw, row=row, rows=rows, freq_hz=freq_hz)
+        data = Visibilities(vis=vis, weight=np.ones(count), uvw=uvw, row=row, rows=rows, freq_hz=freq_hz, **self._where)
         mosaic, beam = _mosaic(primary_beams(data, self._selection, self._grid, self._profiles), self._grid)
         seen = np.flatnonzero(beam >= 0)
         if seen.size:
             operator = sky_operator(uvw[:, seen], replace(self._grid, mosaic=mosaic), freq_hz[seen], beam=beam[seen],
-                                    **self._options)
+                                    **self._accuracy)
             vis[seen] = operator.forward(self._model)
         return vis
 

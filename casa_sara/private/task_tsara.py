@@ -182,7 +182,6 @@ def _refuse_for_mosaics(parameters):
         return
     for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
                                 ("parallel", False, "a mosaic takes one process"),
-                                ("savemodel", "none", "MODEL_DATA is written of single pointings only"),
                                 ("report", False, "reports are made of single pointings only")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")

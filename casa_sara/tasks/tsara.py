@@ -262,7 +262,7 @@ class _tsara:
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
         The model is zero where .pb is below 0.1. Not available with 'mosaic': specmode='cube',
-        parallel=True, savemodel, report and saracompare.
+        parallel=True, report and saracompare.
 
     onepointing : bool, default False
         Opened by gridder = 'standard' or 'wproject'.
