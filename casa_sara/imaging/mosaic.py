@@ -93,7 +93,7 @@ def with_beams(data, selection, grid):
 
 
 def _mosaic(found, grid):
-    """Return the `Mosaic` of the beams that are in the image, and the number of that of each sample or -1, int32 (M,)."""
+    """Return the `Mosaic` of the beams that are in the image, and that of each sample or -1, int32 (M,)."""
     profiles = found.profiles
     centres = [tuple(centre) for centre in found.centres.tolist()]
     beams = [Beam(centres[p], float(profiles.radii[k]), profiles.values[k]) for p, k in found.beams]
@@ -143,7 +143,8 @@ class MosaicModel:
         fields = {(int(ms), int(field)): direction for ms, field, direction in beams["fields"]}
         self._profiles = Profiles(np.asarray(beams["bands_hz"]), [tuple(kind) for kind in beams["kinds"]],
                                   np.asarray(beams["radii"]), np.asarray(beams["values"]))
-        self._where = dict(imaging_weight=None, chan=None, ms_names=selection.vis, phase_center=phase_center, fields=fields)
+        self._where = dict(imaging_weight=None, chan=None, ms_names=selection.vis, phase_center=phase_center,
+                           fields=fields)
 
     def __call__(self, uvw, freq_hz, rows):
         """Return the visibilities, complex (M,), at the phase centre of the image.

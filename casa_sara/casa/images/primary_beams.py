@@ -78,8 +78,8 @@ class PrimaryBeams:
         pairs = sorted({(telescope, *diameters) for telescope, *diameters, _ in self.profiles.kinds})
         dishes = ", ".join(f"{one:g} m with {other:g} m" for _, one, other in pairs)
         bands = ", ".join(f"{band / 1e9:.5g}" for band in self.profiles.bands_hz)
-        return (f"mosaic of {len(self.centres)} pointings: their primary beams are centred on PHASE_DIR of FIELD, POINTING "
-                f"is not used; baselines of dishes of {dishes}; beams at {bands} GHz")
+        return (f"mosaic of {len(self.centres)} pointings: their primary beams are centred on PHASE_DIR of FIELD, "
+                f"POINTING is not used; baselines of dishes of {dishes}; beams at {bands} GHz")
 
 
 def primary_beams(data, selection, grid, profiles=None):
