@@ -246,6 +246,7 @@ def test_pb_and_weight_are_of_beams_and_near_tcleans(mixed, tmp_path, monkeypatc
     assert np.vdot(ours, theirs) / np.vdot(theirs, theirs) == pytest.approx(1, abs=0.015)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mosweight", [True, False])
 def test_weights_by_field_are_tcleans(mixed, tmp_path, monkeypatch, mosweight):
     import casatasks
@@ -257,6 +258,7 @@ def test_weights_by_field_are_tcleans(mixed, tmp_path, monkeypatch, mosweight):
     assert pixels("ours.sumwt")[0, 0] == pytest.approx(pixels("theirs.sumwt")[0, 0], rel=1e-4)
 
 
+@pytest.mark.slow
 def test_one_pointing_is_the_standard_image_over_its_beam(folder, tmp_path, monkeypatch):
     """Dishes of one kind, one field: flat noise is the standard image, the model its model over the beam."""
     monkeypatch.chdir(tmp_path)
@@ -302,6 +304,7 @@ def test_sources_are_recovered_in_place_and_flux(mixed, tmp_path, monkeypatch):
     assert history["residual_snr"]
 
 
+@pytest.mark.slow
 def test_fields_of_several_measurement_sets_are_one_mosaic(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [simulate_mosaic(folder / f"part{k}.ms", HEXAGON[k : k + 2], SKY[:2], dishes=(12.0,) * 8, noise=0.1, seed=5)
@@ -321,6 +324,7 @@ def test_fields_of_several_measurement_sets_are_one_mosaic(folder, tmp_path, mon
     np.testing.assert_allclose(found, expected, atol=2e-4 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_startmodel_is_the_sky(mixed, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     options = GRID | dict(vis=mixed, wavelets=["dirac"], niter=40)

@@ -237,12 +237,20 @@ def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarr
 
 
 _jit = jit.kernel()
-_inner = jit.inner()
+_jit_inner = jit.inner()
 
 
-@_inner
+@_jit_inner
 def beam_at(profile, place):
-    """A at a place in a profile, 0 beyond its end."""
+    """A at a place in a profile, 0 beyond its end.
+
+    Parameters
+    ----------
+    profile : real (K,)
+        As of :class:`Beam`.
+    place : float
+        In steps of the profile.
+    """
     if place >= profile.size - 1:
         return profile[0] * 0
     k = int(place)

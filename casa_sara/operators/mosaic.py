@@ -65,7 +65,19 @@ class MosaicOperator:
         self._vis = np.empty(max((part.index.size for part in self._parts), default=0), self.complex_dtype)
 
     def forward(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the visibilities, complex (M,), of a real image (nx, ny), in `out` where given."""
+        """Return the visibilities of a real image.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            The sky, or the sky times the sensitivity where the mosaic is of flat noise.
+        out : complex (M,), optional
+            Where the result goes.
+
+        Returns
+        -------
+        complex (M,)
+        """
         image = np.ascontiguousarray(image, self.dtype)
         out = np.empty(self.size, self.complex_dtype) if out is None else out
         if image.shape != self.shape or out.shape != (self.size,) or out.dtype != self.complex_dtype:
@@ -80,7 +92,19 @@ class MosaicOperator:
         return out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Return the real image (nx, ny), the adjoint for real inner products, of complex visibilities (M,)."""
+        """Return the adjoint, for real inner products, of visibilities.
+
+        Parameters
+        ----------
+        vis : complex (M,)
+            The visibilities.
+        out : real (nx, ny), optional
+            Where the result goes.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
         vis = np.ascontiguousarray(vis, self.complex_dtype)
         out = np.empty(self.shape, self.dtype) if out is None else out
         if vis.shape != (self.size,) or out.shape != self.shape or out.dtype != self.dtype:
