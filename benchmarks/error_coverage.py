@@ -6,7 +6,7 @@
     python benchmarks/error_coverage.py FOLDER --only table     # the tables of what was run before
     python benchmarks/error_coverage.py FOLDER --scenes arcs_30 # only scenes whose name holds this
     python benchmarks/error_coverage.py FOLDER --ndraws 50
-    python benchmarks/error_coverage.py FOLDER --nothing 6      # p-values of so many empty places of every sky
+    python benchmarks/error_coverage.py FOLDER --nothing 6 # p-values of so many places of every sky where nothing is
 
 All skies are drawn on pixels three times finer than the image's. The model and the truth are smoothed to the restoring
 beam (natural weights; bright skies: Briggs −1), and their difference is divided by the error of that, for all pixels
@@ -14,9 +14,9 @@ where the smoothed model is more than 5 times its error; there are several of th
 scatter of beams, not of pixels. Fluxes are those of islands of S/N 5 and more, each with the surroundings of one beam.
 "The error of a known shape" is what the record has without draws. All run on one thread.
 
-With --nothing, circles of one beam's radius, two beams away from where the smoothed truth is above a thousandth of
-its peak, are tested as saracompare's features are, on the images that an earlier run has left; the p-values should
-be uniform.
+With --nothing, circles of one beam's radius, two beams away from where the smoothed truth is above a thousandth of its
+peak, are tested as saracompare's features are, on the images that an earlier run has left; the p-values should be
+uniform.
 """
 
 from __future__ import annotations

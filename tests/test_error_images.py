@@ -189,6 +189,28 @@ def test_a_restoring_beam_that_is_asked_for_is_that_of_the_errors(vis, folder):
     assert os.path.exists(f"{name}.model.error") and not os.path.exists(f"{name}.image.error")
 
 
+@pytest.mark.parametrize("changes", [
+    dict(significance=0.0), dict(databound="weights"), dict(databound="fixed", l2bound=[1.1]), dict(positivity=False),
+    dict(stokes="V", positivity=False), dict(nreweights=0), dict(niter=60), dict(spectralindex=-0.7),
+    dict(gridder="wproject"), dict(mask="circle[[49pix,44pix],9pix]"),
+], ids=str)
+def test_errors_of_every_kind_of_solution(vis, folder, changes):
+    """A few times the noise at the peak of the model; where there is no model, as in Stokes V, no errors."""
+    result, lines = image(vis, folder / "kind", ndraws=3, overwrite=True, **changes)
+    model = pixels(folder / "kind.model")
+    if "stokes" in changes:
+        assert not model.any() and any("no draws: the model is empty" in line for line in lines)
+        assert not os.path.exists(f"{folder / 'kind'}.model.error")
+        return
+    error = pixels(folder / "kind.image.error")
+    assert np.isfinite(error).all() and (error >= 0).all()
+    peak = np.unravel_index(model.argmax(), model.shape)
+    assert 0.3 < error[peak] / result["sara"]["chosen"]["noise_jy_per_beam"] < 8
+    if "mask" in changes:
+        x, y = np.indices(model.shape)
+        assert not pixels(folder / "kind.model.error")[np.hypot(x - 49, y - 44) > 9.5].any()
+
+
 @pytest.mark.parametrize("changes", [dict(ndraws=1), dict(niter=0), dict(specmode="cube", nchan=1),
                                      dict(method="dabbech2018")])
 def test_what_has_no_errors_is_refused(vis, folder, changes):

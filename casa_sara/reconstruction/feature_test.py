@@ -54,8 +54,7 @@ class FeatureResult:
 
         It is what lets a few draws tell of far smaller probabilities than one in their number, by extrapolation.  The
         prior may let T be negative: the distribution then begins at the least of the draws.  No p-value is less than
-        that of √T standard deviations, with which emission is detected whose place and shape are known (nor than
-        1e-300).
+        that of √T standard deviations, with which emission of known place and shape is detected, nor than 1e-300.
         """
         least = min(float(np.min(self.drawn)), 0.0)
         mean, variance = float(np.mean(self.drawn)) - least, float(np.var(self.drawn, ddof=1))

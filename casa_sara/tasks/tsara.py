@@ -490,8 +490,10 @@ class _tsara:
         region. imagename.draws.npz keeps the differences, from which the error of any sum follows.
         The errors are those of the noise, and of what the prior does to the model. Calibration errors
         count as far as they raise the noise found; where nothing is detected the model, and its error,
-        are zero. Neighbouring pixels are correlated: their errors do not add up in quadrature.
-        A draw takes 90 iterations, 20 draws 4 to 8 times the time of the run itself. Ctrl-C ends the
+        are zero. Flux on scales that no baseline measures is not in the errors. Neighbouring pixels
+        are correlated: their errors do not add up in quadrature. On simulated skies the truth at one
+        beam lies within 1 error in 55 to 75 % of the pixels with S/N above 5, within 2 in 85 to 96 %.
+        A draw takes 90 iterations, 20 draws 3 to 7 times as long as the run itself. Ctrl-C ends the
         draws with the errors that those made so far give; restart=True makes the others. For
         continuum images with method='tsara'; 2 draws or more.
 
