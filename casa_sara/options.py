@@ -58,9 +58,10 @@ class Spectrum:
 class ImageGrid:
     """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
 
-    `spectrum` is what `spectralindex` stands for, once it has been read. `start` and `width` of a cube's spectral axis
-    are '', a channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say
-    where the model may be.
+    `spectrum` is what `spectralindex` stands for, once it has been read, and `mosaic` the primary beams of
+    gridder='mosaic', a :class:`casa_sara.operators.beams.Mosaic`. `start` and `width` of a cube's spectral axis are '',
+    a channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say where the
+    model may be.
     """
 
     shape: tuple[int, int]
@@ -72,6 +73,8 @@ class ImageGrid:
     gridder: str = "standard"
     spectralindex: str = ""
     spectrum: Spectrum | None = None
+    mosaic: Any = None
+    onepointing: bool = False
     specmode: str = "mfs"
     nchan: int = -1
     start: int | str = ""
@@ -90,6 +93,11 @@ class ImageGrid:
         return self.specmode == "cube"
 
     @property
+    def is_mosaic(self) -> bool:
+        """Whether the model is the sky, seen through the primary beam of each pointing."""
+        return self.gridder == "mosaic"
+
+    @property
     def masked(self) -> bool:
         """Whether the model is confined to a part of the image."""
         return self.usemask == "pb" or bool(self.mask)
@@ -97,12 +105,16 @@ class ImageGrid:
 
 @dataclass(frozen=True)
 class Weighting:
-    """Imaging weights of .psf, .residual and .image; they never touch the model."""
+    """Imaging weights of .psf, .residual and .image; they never touch the model.
+
+    `mosweight` says that the fields of a mosaic are weighted separately.
+    """
 
     weighting: str = "natural"
     robust: float = 0.5
     npixels: int = 0
     uvtaper: tuple[str, ...] = ()
+    mosweight: bool = True
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from test_visibilities import observation
 
 from casa_sara.data.averaging import PHASE, Averaged, Cells, cell_sides
 from casa_sara.data.visibilities import sort_into_blocks
+from casa_sara.operators.beams import Beam, Mosaic
 from casa_sara.operators.sky import sky_operator
 from casa_sara.options import ImageGrid, SolverOptions, Spectrum
 from casa_sara.reconstruction.checkpoint import Checkpoint
@@ -265,9 +266,26 @@ def test_nothing_is_averaged_where_it_is_not_worthwhile_or_not_possible():
     assert "databound = 'weights'" in told[0] and "method = 'dabbech2018'" in told[1] and "more than half" in told[2]
 
 
-def norms_of_all(samples, model):
+def test_mosaics_are_not_averaged():
+    """Samples of one uv cell that two pointings have observed are not of one mean."""
+    samples, _ = observed(40)
+    falls = np.linspace(1, 0, 257, dtype=np.float32)
+    beams = tuple(Beam((x, 20.0), 4e-5, falls) for x in (10.0, 38.0))
+    grid = replace(GRID, gridder="mosaic", mosaic=Mosaic(GRID.shape, GRID.cell_rad, beams))
+    data, sky, told = samples.data, sky_of(SOURCES), []
+    data.beam = (data.row % 2).astype(np.int32)
+    seen = sky_operator(data.uvw, grid, beam=data.beam).forward(sky.astype(np.float32))
+    data.vis += seen - fourier(data.uvw, sky, GRID)
+    found = reconstruct(samples, grid, OPTIONS, support=sky > 0, control=Control(tell=told.append))
+    assert told == ["visibilities are not averaged: gridder = 'mosaic'"] and found.averaging == {}
+    np.testing.assert_allclose(found.residual_norms, norms_of_all(samples, found.model, grid), rtol=1e-4)
+    np.testing.assert_allclose(found.model, sky, atol=0.02)
+
+
+def norms_of_all(samples, model, grid=GRID):
     """‖y_j − Φ_j x‖ of all samples, by an operator of their own."""
-    left = (samples.data.vis - sky_operator(samples.data.uvw, GRID).forward(model)) * np.sqrt(samples.data.weight)
+    data = samples.data
+    left = (data.vis - sky_operator(data.uvw, grid, beam=data.beam).forward(model)) * np.sqrt(data.weight)
     return [np.linalg.norm(left[a:b]) for a, b in zip(samples.offsets[:-1], samples.offsets[1:])]
 
 

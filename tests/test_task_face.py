@@ -49,6 +49,7 @@ EXCEPTIONS = {
     ("stokes", "allowed"): NARROWER,
     ("uvtaper", "default"): "[] as tclean's own in the shell; in Python tclean has ['']; both mean none",
     ("usemask", "allowed"): NARROWER,
+    ("usepointing", "allowed"): NARROWER,
     ("weighting", "allowed"): NARROWER,
     ("wprojplanes",
      "default"): "tclean's 1 leaves the w-term out of gridder='wproject'; here -1, as no number is needed",
@@ -314,7 +315,7 @@ def closing_and_opening(parameter):
 )
 def test_sub_parameter_that_would_be_ignored_is_refused(received, parameter):
     closing, opening = closing_and_opening(parameter)
-    other = {"bool": True, "string": "x", "stringVec": ["x"], "double": 0.25, "doubleVec": [0.25],
+    other = {"bool": not parameter.default, "string": "x", "stringVec": ["x"], "double": 0.25, "doubleVec": [0.25],
              "int": 7}[parameter.types[0]]
     other = parameter.allowed[-1] if parameter.allowed else other
     message = f"{parameter.name} = .* has no effect with {parameter.opener} = .*: set {parameter.opener} to"

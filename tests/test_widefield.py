@@ -273,7 +273,7 @@ def test_comparison_takes_the_w_term_into_the_residuals(run, flat, vis):
     (dict(gridder="wproject", wprojplanes=0), "wprojplanes = 0"),
     (dict(gridder="wproject", wprojplanes=-2), "wprojplanes = -2: should be an integer, at least -1"),
     (dict(wprojplanes=16), "wprojplanes = 16 has no effect with gridder = 'standard'"),
-    (dict(gridder="mosaic"), "gridder = 'mosaic': should be a string out of 'standard', 'wproject'")])
+    (dict(gridder="awproject"), "gridder = 'awproject': should be a string out of 'standard', 'wproject', 'mosaic'")])
 def test_what_cannot_be_is_refused(vis, tmp_path, parameters, message):
     with pytest.raises(ValueError, match=message):
         tsara(vis=vis, imagename=str(tmp_path / "none"), **GRID | parameters)

@@ -139,6 +139,7 @@ def _read(request, with_residual, fewest):
     if len(set(names)) < len(names) or any("|" in name or not name.strip() for name in names):
         raise ValueError(f"names = {list(names)}: should differ, not be empty, and hold no '|'")
     sets = [read_image_set(given, name, with_residual) for given, name in zip(models, names or [""] * len(models))]
+    _refuse_mosaics(models, sets)
     taken = set()
     for number, one in enumerate(sets):
         name = one.name.replace("|", "_")
@@ -147,6 +148,14 @@ def _read(request, with_residual, fewest):
         sets[number] = one.called(next(word for word in tries if word not in taken))
         taken.add(sets[number].name)
     return sets
+
+
+def _refuse_mosaics(models, sets):
+    """Raise where a product is of several pointings."""
+    for given, one in zip(models, sets):
+        if one.parameters.get("gridder", "").startswith("mosaic"):
+            raise ValueError(f"models: '{given}' was imaged with gridder = 'mosaic': should be an image of a single "
+                             "pointing, which alone can be compared, and tested with inject and features")
 
 
 def _on_grid(image, plane, first, parameter, notes):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from casa_sara.casa.images.image_plane import define_image_plane
@@ -13,6 +15,7 @@ from casa_sara.casa.ms.weights import dirty_image, imaging_weights
 from casa_sara.casa.runtime import log
 from casa_sara.comparison.injection import spectral_index_of
 from casa_sara.data.blocks import snapshot_blocks
+from casa_sara.imaging.mosaic import check_pointings
 from casa_sara.imaging.plane_images import IMAGE_EPS
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
@@ -40,7 +43,7 @@ class Observed:
         grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
         with kernels_loading(log.info):
             data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
-        notes.extend(data.notes)
+        notes.extend(data.notes + check_pointings(data, replace(grid, onepointing=True)))
         self._gridder = _common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)
         notes.extend(image_plane.notes)

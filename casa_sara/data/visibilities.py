@@ -70,6 +70,10 @@ class Visibilities:
         Name of the telescope, of the first row selected.
     freq_hz : float32 (M,) or None
         LSRK frequencies, where they were asked for.
+    beam : int32 (M,) or None
+        Number of the primary beam of each sample, where they are modelled.
+    fields : dict
+        (number of the MeasurementSet, number of the field) → its direction, a CASA direction measure.
     mixed_weights : bool
         Whether some rows of a MeasurementSet have a WEIGHT_SPECTRUM and others have not.
     """
@@ -90,6 +94,8 @@ class Visibilities:
     spws: dict[int, tuple[int, ...]] = field(default_factory=dict)
     observatory: str = ""
     freq_hz: np.ndarray | None = None
+    beam: np.ndarray | None = None
+    fields: dict[tuple[int, int], dict] = field(default_factory=dict)
     mixed_weights: bool = False
 
     @property
@@ -110,7 +116,7 @@ class Visibilities:
         Visibilities
         """
         per_sample = ["vis", "weight", "imaging_weight", "uvw", "row", "chan"]
-        per_sample += ["freq_hz"] if self.freq_hz is not None else []
+        per_sample += [name for name in ("freq_hz", "beam") if getattr(self, name) is not None]
         taken: dict[str, Any] = {name: np.take(getattr(self, name), index, axis=-1) for name in per_sample}
         return replace(self, **taken)
 

@@ -15,6 +15,7 @@ from casa_sara.casa.images.products import write_images, write_products
 from casa_sara.casa.images.spectral_index import with_spectrum
 from casa_sara.casa.ms.block_selection import divide
 from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.ms.weights import imaging_weights
 from casa_sara.casa.runtime import log
 from casa_sara.casa.runtime.child_process import waiting_child
 from casa_sara.casa.runtime.tools import opened
@@ -32,6 +33,7 @@ from casa_sara.imaging.data_quality import (
 )
 from casa_sara.imaging.dry_run import forecast_run
 from casa_sara.imaging.error_images import error_images
+from casa_sara.imaging.mosaic import check_pointings, weight_image, with_beams
 from casa_sara.imaging.plane_images import plane_images, point_spread
 from casa_sara.imaging.predict_model import save_model
 from casa_sara.imaging.run_solver import (
@@ -179,9 +181,16 @@ class _Solution:
 def _read(request, ranks):
     """Return this rank's visibilities, and the plane of the image with its first model and support."""
     grid, output, comm = request.grid, request.output, ranks.comm
-    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex), ranks)
+    frequencies = bool(grid.spectralindex) or grid.is_mosaic
+    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks)
+    data.notes.extend(check_pointings(data, grid))
+    if grid.is_mosaic:
+        data, grid = with_beams(data, request.selection, grid)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
+    if grid.is_mosaic:
+        weights = imaging_weights(data, grid, request.weighting, comm)
+        plane = plane.of_mosaic(weight_image(data, grid, weights), output.pblimit)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
@@ -240,6 +249,8 @@ def _look_back(images, plane, solution, comm):
     if plane.support is not None:
         pixels["mask"] = check_confined(pixels["model"], plane.support)
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
+        if "weight" in pixels:  # of flat noise
+            sigma /= float(pixels["weight"].max()) ** 0.5
         _caution(data, left_outside(pixels["residual"], plane.support, sigma))
     return doubtful
 

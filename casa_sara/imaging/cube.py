@@ -19,6 +19,7 @@ from casa_sara.imaging.continuum import Result, describe, split
 from casa_sara.imaging.cube_checkpoint import CubeCheckpoint
 from casa_sara.imaging.data_quality import image_limits, nowhere_visible
 from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.mosaic import check_pointings
 from casa_sara.imaging.plane_images import plane_images
 from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
@@ -91,7 +92,7 @@ def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | No
     # read
     with kernels_loading(log.info):
         data = read_visibilities(request.selection, grid.phasecenter, grid.stokes)
-    data.notes.extend(image_limits(data, grid))
+    data.notes.extend(check_pointings(data, grid) + image_limits(data, grid))
     cube = _Cube.of(request, data, forecast.workload.channels)
     check_imagename(output.imagename, cube.plane.pb.shape, 2 * output.pbcor)
     for note in data.notes:

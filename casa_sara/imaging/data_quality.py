@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import gaussian_filter, label
 
+from casa_sara.imaging.mosaic import w_note
 from casa_sara.operators.measurement import check_cell, check_field
 from casa_sara.parallel.serial import SERIAL
 
@@ -197,6 +198,8 @@ def image_limits(data, grid, comm=SERIAL):
         notes.append(f"cell = '{arcsec:.4g}arcsec' gives the finest fringe {pixels:.2g} pixels: below "
                      f"{FEWEST_PIXELS:g} sources between pixels cannot be represented; 5 would be cell = "
                      f"'{arcsec * pixels / 5:.3g}arcsec'")
+    if grid.is_mosaic:
+        return notes + w_note(data, grid.mosaic, LARGEST_W_PHASE)
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
     phase = np.pi * max_w * corner_sq
     if phase > LARGEST_W_PHASE and grid.gridder == "standard":

@@ -19,6 +19,7 @@ from casa_sara.casa.runtime import log
 from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.imaging.load_balance import assign_ranks
 from casa_sara.imaging.memory_forecast import Workload, forecast
+from casa_sara.imaging.mosaic import check_pointings, with_beams
 from casa_sara.imaging.time_forecast import measure
 from casa_sara.operators.measurement import check_field
 from casa_sara.parallel.serial import SERIAL
@@ -110,7 +111,10 @@ def dry_run(selection, grid, options, blocks, limits):
             log.warn(str(error))
             return found.summary() | {"reason": str(error)}
     start = time.perf_counter()
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex))
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex) or grid.is_mosaic)
+    check_pointings(data, grid)
+    if grid.is_mosaic:
+        data, grid = with_beams(data, selection, grid)
     if grid.spectralindex:
         grid = with_spectrum(grid, define_image_plane(data, selection, grid))
     everything = data.size

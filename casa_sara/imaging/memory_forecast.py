@@ -80,12 +80,13 @@ class Workload:
         writes, bases = ranks.comm.rank == 0, len(options.wavelets)
         return cls(math.ceil(volume.samples * ranks.share), volume.reach, grid.shape, grid.cell_rad,
                    len(ranks.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
-                   options.precondition, report and writes, grid.gridder, volume.max_w, bool(grid.spectralindex), band,
-                   masked=grid.masked,
+                   options.precondition, report and writes, grid.gridder, volume.max_w,
+                   bool(grid.spectralindex) or grid.is_mosaic, band, masked=grid.masked,
                    whole=(volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
-                   duals=3 if options.method == "dabbech2018" else 2, averages=options.averages)
+                   duals=3 if options.method == "dabbech2018" else 2,
+                   averages=options.averages and not grid.is_mosaic)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from casa_sara.casa.images.restore import fit_beam
 from casa_sara.casa.ms.weights import dirty_image, imaging_weights, sum_of_weights
+from casa_sara.imaging.mosaic import flat_noise, weight_image
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.sky import sky_operator
 from casa_sara.parallel.serial import SERIAL
@@ -19,7 +20,10 @@ IMAGE_EPS = 1e-6  # accuracy of the PSF, residual images and the model column
 
 @dataclass
 class PlaneImages:
-    """The images of one plane: `pixels` are 'psf', 'residual', 'model', float32 (nx, ny); `weights` (M,) made them."""
+    """The images of one plane: `pixels` are 'psf', 'residual', 'model' and, of a mosaic, 'weight', float32 (nx, ny).
+
+    `weights` (M,) made them.
+    """
 
     pixels: dict[str, np.ndarray]
     weights: np.ndarray
@@ -62,24 +66,41 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     PlaneImages
     """
     weights, operator, psf, beam = point_spread(data, grid, weighting, options, plane, comm)
+    if grid.is_mosaic:
+        operator = _operator(data, grid, options, comm)
     residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
+    pixels = dict(psf=psf, residual=residual, model=model)
+    if grid.is_mosaic:
+        pixels["weight"] = weight_image(data, grid, weights)
+        pixels["residual"] = flat_noise(residual, pixels["weight"])
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too
         sumwt = float(weights.sum(dtype=float))
     else:
         sumwt = sum_of_weights(data, weights, grid.stokes)
-    return PlaneImages(dict(psf=psf, residual=residual, model=model), weights, comm.total(sumwt), beam)
+    return PlaneImages(pixels, weights, comm.total(sumwt), beam)
 
 
 def _predicted(operator, data, grid, options, model, comm):
     """Return the visibilities of a model, by the operator of the dirty images unless there is a spectrum."""
     if grid.spectrum is not None:
-        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm)
+        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm,
+                                beam=data.beam)
     return operator.forward(model)
 
 
+def _operator(data, grid, options, comm):
+    """Return the operator of the dirty images, for flat spectra."""
+    return Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm, beam=data.beam),
+                  comm)
+
+
 def point_spread(data, grid, weighting, options, plane, comm):
-    """Return the imaging weights, the operator of the dirty images (flat spectra), the PSF and its fitted beam."""
+    """Return the imaging weights, the operator of the PSF (flat spectra), the PSF and its fitted beam.
+
+    The PSF of a mosaic is that of all samples without their primary beams.
+    """
     weights = imaging_weights(data, grid, weighting, comm)
-    operator = Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm), comm)
+    single = replace(grid, gridder="standard", mosaic=None) if grid.is_mosaic else grid
+    operator = _operator(data, single, options, comm)
     psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
     return weights, operator, psf, comm.once(fit_beam, psf, plane)

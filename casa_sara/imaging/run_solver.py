@@ -17,6 +17,7 @@ from casa_sara.casa.ms.weights import sampling_density
 from casa_sara.casa.runtime import log
 from casa_sara.data.visibilities import BlockInfo, Visibilities, clock
 from casa_sara.imaging.time_forecast import Pace
+from casa_sara.operators.beams import mosaic_density
 from casa_sara.options import ImageGrid, ImagingRequest, Selection, SolverOptions
 from casa_sara.parallel.partition import ALONE, RankAssignment
 from casa_sara.parallel.serial import SERIAL, Serial
@@ -62,7 +63,7 @@ def checkpoint_of(request: ImagingRequest) -> Checkpoint:
     parameters = asdict(request.selection) | asdict(request.grid) | asdict(request.options)
     parameters |= dict(blocks=output.blocks, startmodel=startmodel)
     parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
-    for name in ("vis", "nthreads", "spectrum"):
+    for name in ("vis", "nthreads", "spectrum", "mosaic"):
         del parameters[name]
     return Checkpoint(output.imagename + CHECKPOINT, __version__, parameters, log.info, log.warn)
 
@@ -87,6 +88,8 @@ def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid,
     if not options.precondition:
         return np.ones(data.size, np.float32)
     log.info("computing the density of the uv coverage")
+    if grid.mosaic is not None:
+        return mosaic_density(data.uvw, data.beam, data.imaging_weight, grid.mosaic)
     return sampling_density(data, selection, grid, comm)
 
 

@@ -12,6 +12,8 @@ its borders; z extends over them by the length of the taps.
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 import numpy.typing as npt
 
@@ -96,6 +98,7 @@ def _spectrum(lowpass, frequency):
     return np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * frequency), series)
 
 
+@functools.lru_cache(maxsize=64)
 def _lowpass(reach, factor, eps, largest_gain):
     """Shortest taps for the band |u| ≤ reach that meet two bounds.
 
@@ -122,7 +125,8 @@ def _windowed_sinc(half, reach, factor, eps, largest_gain):
     band = np.linspace(-reach, reach, 33)
     passed = _spectrum(lowpasses, band)
     aliases = _spectrum(lowpasses, band + np.arange(1, factor)[:, None] / factor)
-    level = np.max(np.sqrt(np.sum(aliases**2, axis=1)) / np.abs(passed), axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):  # taps that pass nothing of some frequency are not good
+        level = np.max(np.sqrt(np.sum(aliases**2, axis=1)) / np.abs(passed), axis=1)
     good = (level <= eps) & (passed.min(axis=1) * largest_gain >= passed.max(axis=1))
     return lowpasses[:, np.argmin(np.where(good, level, np.inf))] if good.any() else None
 

@@ -28,7 +28,7 @@ from casa_sara.operators.nufft import NonUniformFFT, memory_size
 from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "check_cell", "check_field", "choose_eps", "grid_bytes",
-           "share_of"]
+           "share_of", "share_work_space"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 LARGEST_EPS = 1e-4
@@ -54,8 +54,8 @@ class MeasurementOperator:
         Accuracy: bound on ‖error‖/‖result‖; at least 1e-6 in single and 1e-13 in double precision.
     dtype : float32 or float64
         Of images; visibilities are complex of the same precision.
-    nthreads : int
-        Threads used by each call.
+    nthreads : int or Workers
+        Threads used by each call, or the threads themselves.
     whole : (int, (float, float)), optional
         Number of all visibilities and their largest |u| and |v| in wavelengths, where `uv` is a share of them: grid and
         kernel, and with them the errors, are those of the whole.
@@ -74,7 +74,7 @@ class MeasurementOperator:
     def __init__(self, uv: np.ndarray, cell_rad: npt.ArrayLike,  # noqa: PLR0913 - five have a default
                  shape: tuple[int, int], row_scale: np.ndarray | None = None, eps: float = 1e-6,
                  dtype: npt.DTypeLike = np.float32,
-                 nthreads: int = 1, whole: tuple[int, npt.ArrayLike] | None = None) -> None:
+                 nthreads: int | Workers = 1, whole: tuple[int, npt.ArrayLike] | None = None) -> None:
         uv = np.asarray(uv, dtype=np.float64)
         if uv.ndim != 2 or uv.shape[0] != 2 or uv.shape[1] == 0 or not np.all(np.isfinite(uv)):
             raise ValueError(f"uv must be finite and of shape (2, M) with M >= 1, not {uv.shape}")
@@ -90,7 +90,7 @@ class MeasurementOperator:
         row_scale = np.broadcast_to(1.0, self.size) if row_scale is None else np.asarray(row_scale, np.float64)
         if row_scale.shape != (self.size,):
             raise ValueError(f"row_scale must have shape ({self.size},), not {row_scale.shape}")
-        self.workers = Workers(nthreads)
+        self.workers = nthreads if isinstance(nthreads, Workers) else Workers(nthreads)
         frequencies = _cycles_per_pixel(uv, cell_rad)
         scales = np.stack([row_scale, row_scale], axis=1, dtype=self.dtype, casting="same_kind")
         lower = frequencies[1] < 0  # V(−u, −v) is the conjugate of V(u, v)
@@ -162,6 +162,24 @@ class MeasurementOperator:
         self.workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
         self.workers.run(expand_rows, self._lines, self._rows, out)
         return out
+
+
+def share_work_space(operators: Sequence[MeasurementOperator]) -> None:
+    """Let operators that are applied one after the other share their grids: they hold what the largest of them needs.
+
+    Parameters
+    ----------
+    operators : sequence of MeasurementOperator
+        Of one precision.
+    """
+    if len(operators) < 2:
+        return
+    transforms = [operator._nufft for operator in operators]
+    memory = np.empty(max(transform.memory_size for transform in transforms), operators[0].dtype)
+    lines = np.empty(max(operator._lines.size for operator in operators), operators[0].dtype)
+    for operator, transform in zip(operators, transforms):
+        transform.work_in(memory)
+        operator._lines = lines[: operator._lines.size].reshape(operator._lines.shape)
 
 
 class NoVisibilities:

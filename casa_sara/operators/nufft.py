@@ -105,9 +105,31 @@ class NonUniformFFT:
             top, bottom = rows[low:high].min(), rows[low:high].max() + width
             self._pieces[piece] = top, bottom, end - top * self._stride
             end += (bottom - top) * self._stride
-        self._memory = np.zeros(end, dtype)
-        self._cells = self._memory[: height * self._stride]
-        self.grid = self._cells.view(np.result_type(dtype, np.complex64)).reshape(height, -1)[:, : self._lengths[1]]
+        self._memory, self._height = np.zeros(end, dtype), height
+        self._lay_out_grid()
+
+    def _lay_out_grid(self):
+        """The grid at the beginning of the memory."""
+        self._cells = self._memory[: self._height * self._stride]
+        complex_cells = self._cells.view(np.result_type(self._cells.dtype, np.complex64))
+        self.grid = complex_cells.reshape(self._height, -1)[:, : self._lengths[1]]
+
+    @property
+    def memory_size(self) -> int:
+        """Number of reals in the grid and the pieces."""
+        return self._memory.size
+
+    def work_in(self, memory: np.ndarray) -> None:
+        """Work in this memory from now on, which others may use between the calls.
+
+        Parameters
+        ----------
+        memory : real (n,)
+            n is at least `memory_size`.
+        """
+        self._memory = memory[: self._memory.size]
+        self._lay_out_grid()
+        self._find_filled()
 
     def _place_samples(self, starts, counts, width, beta):
         """Where samples go in the grid, and their factors; (−1)^i moves frequency 0 to its middle."""
@@ -115,8 +137,13 @@ class NonUniformFFT:
         self.placement = [
             (offset + p % length, (1 - 2.0 * (p % 2)) / kaiser_bessel.transform(p / length, width, beta))
             for p, length, offset in zip(positions, self._lengths, (self._halo, 0))]
+        self._rows_filled = starts[0] + counts[0], self._lengths[0] + starts[0]
+        self._find_filled()
+
+    def _find_filled(self):
+        """The rows of the grid that hold samples."""
         inner = self.grid[self._halo : self._halo + self._lengths[0]]
-        parts = inner[: starts[0] + counts[0]], inner[len(inner) + starts[0] :]
+        parts = inner[: self._rows_filled[0]], inner[self._rows_filled[1] :]
         self._filled = [part for part in parts if part.size]
 
     def clear(self) -> None:

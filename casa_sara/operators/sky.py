@@ -1,4 +1,4 @@
-"""The measurement operator of an image: two-dimensional, with the w-term, or with a known spectrum.
+"""The measurement operator of an image: two-dimensional, with the w-term, of a mosaic, or with a known spectrum.
 
 Where the brightness follows a power law of the frequency with a known index,
 
@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, NoVisibilities, share_of
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
+from casa_sara.operators.mosaic import MosaicOperator
 from casa_sara.operators.widefield import WGridder, WTerm, w_operator
 from casa_sara.options import LARGEST_INDEX, ImageGrid
 from casa_sara.parallel.serial import SERIAL, Serial
@@ -27,13 +28,14 @@ __all__ = ["further_bytes", "sky_operator"]
 # bytes of one sample and of one pixel, beyond what the plain operator has
 SERIES_SAMPLE, SERIES_PIXEL = 16, 16  # rotation and one term; place, two polynomials and one image
 GRIDDER_SAMPLE, GRIDDER_PIXEL = 80, 80  # what it holds, and the grids and indices of a call
+MOSAIC_SAMPLE, MOSAIC_PIXEL = 24, 24  # rotation, index and beam, and the visibilities of one beam; images of flat noise
 
 
-def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - six have a default
+def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have a default
                  freq_hz: np.ndarray | None = None, row_scale: np.ndarray | None = None, eps: float = 1e-6,
                  dtype: npt.DTypeLike = np.float32,
-                 nthreads: int = 1,
-                 comm: Serial = SERIAL) -> MeasurementOperator | ModulatedOperator | WGridder | NoVisibilities:
+                 nthreads: int = 1, comm: Serial = SERIAL, beam: np.ndarray | None = None,
+                 ) -> MeasurementOperator | ModulatedOperator | MosaicOperator | WGridder | NoVisibilities:
     """Return the measurement operator of an image.
 
     Parameters
@@ -41,19 +43,23 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - six have a
     uvw : float64 (3, M)
         Baselines in wavelengths.
     grid : casa_sara.options.ImageGrid
-        `shape`, `cell_rad`, `gridder` and `spectrum` decide.
+        `shape`, `cell_rad`, `gridder`, `mosaic` and `spectrum` decide.
     freq_hz : real (M,), optional
         Frequencies; without them the sky is as bright at all frequencies as at the reference.
     row_scale, eps, dtype, nthreads
         As of :class:`casa_sara.operators.measurement.MeasurementOperator`, whose interface the result has.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the visibilities are spread; the result is of this rank's.
+    beam : int (M,), optional
+        Number of the primary beam of each sample, of a mosaic.
 
     Returns
     -------
-    MeasurementOperator, ModulatedOperator, WGridder or NoVisibilities
+    MeasurementOperator, ModulatedOperator, MosaicOperator, WGridder or NoVisibilities
     """
     def of_place(row_scale, eps):
+        if grid.mosaic is not None:
+            return MosaicOperator(uvw, np.asarray(beam), grid.mosaic, row_scale, eps, dtype, nthreads)
         return _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm)
 
     spectrum = grid.spectrum if freq_hz is not None else None
@@ -114,6 +120,8 @@ def further_bytes(samples: int, grid: Any, max_w: float = 0.0, band: float = 0.0
         terms = WTerm.of(max_w, grid.shape, grid.cell_rad, eps).terms
         size += (SERIES_SAMPLE + 4 * terms) * samples + SERIES_PIXEL * pixels if terms else \
             GRIDDER_SAMPLE * samples + GRIDDER_PIXEL * pixels
+    if grid.gridder == "mosaic":
+        size += MOSAIC_SAMPLE * samples + MOSAIC_PIXEL * pixels
     if band > 0:
         terms = terms_needed(LARGEST_INDEX * band, eps / 4, modified=True)
         size += (SERIES_SAMPLE + 4 * terms) * samples + SERIES_PIXEL * pixels

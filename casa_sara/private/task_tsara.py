@@ -44,6 +44,7 @@ ARCSEC = math.pi / 180 / 3600
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     _check_method(parameters)
+    _refuse_for_mosaics(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -56,7 +57,7 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     selection = selection_of(parameters)
     grid = _grid(parameters)
     weighting = Weighting(parameters["weighting"], parameters["robust"], parameters["npixels"],
-                          tuple(parameters["uvtaper"]))
+                          tuple(parameters["uvtaper"]), parameters["mosweight"])
     options = _solver_options(parameters, comm)
     _refuse_for_cubes(parameters)
     _check_errors(parameters)
@@ -131,7 +132,7 @@ def _grid(parameters):
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
                      spectralindex=_spectral_index(parameters), usemask=parameters["usemask"], mask=_mask(parameters),
-                     pbmask=parameters["pbmask"], **_spectral(parameters))
+                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], **_spectral(parameters))
 
 
 def _spectral_index(parameters):
@@ -190,6 +191,19 @@ def _check_errors(parameters):
                              f"{right}")
     if parameters["ndraws"] == 1:
         raise ValueError("ndraws = 1: an error takes two draws or more; should be 0, or at least 2 (20 are usual)")
+
+
+def _refuse_for_mosaics(parameters):
+    """Raise on parameters that mosaics do not have."""
+    if parameters["gridder"] != "mosaic":
+        return
+    for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
+                                ("parallel", False, "a mosaic takes one process"),
+                                ("report", False, "reports are made of single pointings only"),
+                                ("ndraws", 0, "errors by bootstrap are of single pointings only"),
+                                ("jackknife", False, "errors by jackknife are of single pointings only")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
 
 
 def _check_stokes(parameters):

@@ -102,7 +102,8 @@ class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
     `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
-    `samples` where that is None. `support` is None where all pixels may be non-zero.
+    `samples` where that is None. `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image
+    times `sky_over_image`.
     """
 
     samples: Samples
@@ -114,6 +115,7 @@ class Problem:
     unit_jy: float
     support: np.ndarray | None = None
     averaged: Averaged | None = None
+    sky_over_image: np.ndarray | None = None
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - four have a default
@@ -151,10 +153,11 @@ class Problem:
         data, root_weight = samples.data, np.sqrt(samples.data.weight)
         operator = partial(sky_operator, grid=grid, eps=eps, nthreads=options.nthreads, comm=comm)
         vis, offsets = data.vis * root_weight, samples.offsets
-        measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy))
+        measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy),
+                               beam=data.beam)
         precond = _preconditioner(samples, options.precondition, comm)
         averaged = None
-        if options.averages:
+        if options.averages and grid.mosaic is None:
             with suppress(OverflowError):  # hardly two samples share one of so many cells
                 averaged, uvw, freq_hz = Averaged.of(data, offsets, averaging_cell(grid), finer, vis, measurement, comm)
         if averaged is not None and comm.total(averaged.cells.size) > WORTHWHILE * comm.total(data.size):
@@ -168,7 +171,23 @@ class Problem:
             whole = Summed(measurement, comm)
             data_norm_sq = float(comm.bcast(power_method(
                 lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32)))
-        return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged)
+        return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
+                   grid.mosaic and grid.mosaic.over)
+
+    def flux_jy(self, image: np.ndarray) -> float:
+        """Return Σ|I| of the sky of an image, which no visibility of it exceeds.
+
+        Parameters
+        ----------
+        image : real (nx, ny)
+            In `unit_jy`.
+
+        Returns
+        -------
+        float
+        """
+        sky = image if self.sky_over_image is None else image * self.sky_over_image
+        return self.unit_jy * float(np.abs(sky).sum(dtype=float))
 
 
 def averaging_cell(grid: ImageGrid) -> np.ndarray:
@@ -226,8 +245,7 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         if error.max() > LARGEST_ERROR and finer.max() < MOST_HALVINGS:  # it goes with the square of the side
             finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
             continue
-        found = find_wild(samples.data, samples.offsets, residual,
-                          problem.unit_jy * float(np.abs(first).sum(dtype=float)), comm)
+        found = find_wild(samples.data, samples.offsets, residual, problem.flux_jy(first), comm)
         if comm.total(found.index.size) == 0 or rounds == ROUNDS:
             break
         wild += _told_of_all(found, samples, layout, comm)

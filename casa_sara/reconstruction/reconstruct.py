@@ -19,6 +19,7 @@ from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.bootstrap import Bootstrap, Jackknife, jackknife_groups
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.draws import FEWEST, Draws
+from casa_sara.reconstruction.flat_noise import FlatNoise
 from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_threshold, paper_bounds, paper_iteration
 from casa_sara.reconstruction.problem import DYNAMIC_RANGE, Findings, Problem, Samples, averaging_cell, first_image
 from casa_sara.reconstruction.state_file import digest
@@ -176,6 +177,9 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     """
     comm, checkpoint = ranks.comm, control.checkpoint
     _check_blocks(options, len(samples.offsets) - 1)
+    flat = FlatNoise.of(samples.data, grid, comm)
+    if flat is not None:
+        grid, support, startmodel = flat.grid(grid), flat.support(support), flat.image(startmodel)
     # images in units of the noise of one sample: every number is near 1
     unit_jy = float(comm.mean(samples.data.weight, dtype=float) ** -0.5)
     problem_of = partial(Problem.of, grid=grid, options=options, unit_jy=unit_jy, support=support, comm=comm,
@@ -190,13 +194,13 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         if control.stopped():
             control = replace(control, checkpoint=None)
     averaging = _averaging(solution, averaging_cell(grid))
-    control.tell(_averaging_words(solution.ppd, averaging, options, averaging_cell(grid)))
+    control.tell(_averaging_words(solution.ppd, averaging, options, grid))
     if solution.result is None:
         _solve(solution, samples, averaging, options, control, layout, ranks)
     for name, resampling in solution.resamplings.items():
         if not _draw(solution, name, resampling, control, layout, ranks):
             break
-    return solution.result
+    return solution.result if flat is None else flat.of_sky(solution.result)
 
 
 def _solve(solution, samples, averaging, options, control, layout, ranks):
@@ -227,8 +231,9 @@ def _averaging(solution, sides):
                 halvings=found.finer.tolist(), largest_error=found.averaging_error)
 
 
-def _averaging_words(ppd, averaging, options, sides):
+def _averaging_words(ppd, averaging, options, grid):
     """Return the line of the log on it."""
+    sides = averaging_cell(grid)
     cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
     if averaging:
         smaller = 2 ** max(averaging["halvings"])
@@ -236,6 +241,8 @@ def _averaging_words(ppd, averaging, options, sides):
         return (f"{ppd.samples.sum()} visibilities are averaged to {averaging['averages']}, within each block and "
                 f"{cell}{finer}: the averages of the first image are wrong by up to "
                 f"{averaging['largest_error']:.2g} of their noise, which is put right at every re-weighting")
+    if options.averages and grid.mosaic is not None:
+        return "visibilities are not averaged: gridder = 'mosaic'"
     if options.averages:
         return f"visibilities are not averaged: more than half of them would be left by {cell}"
     return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"
@@ -250,7 +257,8 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
         if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
     spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
-        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex).items()}
+        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex,
+        sensitivity=grid.mosaic and grid.mosaic.over).items()}
     comm.once(checkpoint.identify, **digests)
 
 
@@ -345,7 +353,7 @@ class _Solution:
         else:
             ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=ranks.comm)
-        ppd.unit_jy, ppd.averaged = problem.unit_jy, problem.averaged
+        ppd.unit_jy, ppd.averaged, ppd.sky_over_image = problem.unit_jy, problem.averaged, problem.sky_over_image
         ppd.samples = ranks.comm.exscan(np.diff(samples.offsets))[1]
         if problem.support is not None:
             ppd.confine(problem.support)

@@ -127,6 +127,8 @@ class AdaptivePPD:
         Σx and max x after the last step.
     unit_jy : float
         Jy/pixel in the unit of the model, for the record.
+    sky_over_image : real (nx, ny) or None
+        Of a mosaic, by which the model is multiplied to be the sky, for the record.
     """
 
     def __init__(self, measurement: Measurement, dictionary: Prior,  # noqa: PLR0913 - Φ, Ψ, y, U of the paper
@@ -163,6 +165,7 @@ class AdaptivePPD:
         self._sums, = comm.shared_images(1, (measurement.shape[0], 4), float)
         self.iteration = 0
         self.unit_jy = 1.0
+        self.sky_over_image: np.ndarray | None = None
 
     @property
     def scratch_vis(self) -> np.ndarray:
@@ -315,6 +318,9 @@ class AdaptivePPD:
         sums = [*sums.tolist(), float(greatest)]
         change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
+        if self.sky_over_image is not None:
+            sky = np.multiply(self.model, self.sky_over_image, out=self.scratch_image)
+            self.model_flux, self.model_max = float(sky.sum(dtype=float)), float(sky.max())
 
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.

@@ -40,7 +40,7 @@ def look_at(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, record: Solv
     filter_ = matched_filter(ppd, bounds)
     gradient = gradient_image(ppd, bounds, ppd.model)
     record.residual_snr = ppd.comm.once(_peaks, filter_, gradient)
-    record.islands = ppd.comm.once(islands_of, ppd.model, filter_.psf, ppd.unit_jy)
+    record.islands = ppd.comm.once(islands_of, ppd.model, filter_.psf, ppd.unit_jy, ppd.sky_over_image)
     return any(entry["snr"] > STRUCTURE for entry in record.residual_snr if entry["beams"] >= 1)
 
 
@@ -51,7 +51,8 @@ def _peaks(filter_, gradient):
             for scale, beams in enumerate(BEAMS[:len(filter_.widths)])]
 
 
-def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list[dict[str, Any]]:
+def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0,
+               sky_over_image: np.ndarray | None = None) -> list[dict[str, Any]]:
     """List the connected regions of a model, the most significant first.
 
     Parameters
@@ -62,6 +63,8 @@ def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list
         Φ†Σ⁻¹Φ of a pixel of 1 at (nx // 2, ny // 2).
     unit_jy : float
         Jy in the unit of the model.
+    sky_over_image : real (nx, ny), optional
+        Of a mosaic, by which x is multiplied to be the sky.
 
     Returns
     -------
@@ -82,7 +85,7 @@ def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0) -> list
         centre = [float(size.sum(axis=1) @ x / total), float(size.sum(axis=0) @ y / total)]
         spread = (size.sum(axis=1) @ (x - centre[0]) ** 2 + size.sum(axis=0) @ (y - centre[1]) ** 2) / total
         snr = float(np.sqrt(max(np.vdot(part, _response(part, psf)), 0.0)))
-        flux = float(part.sum() * unit_jy)
+        flux = float((part if sky_over_image is None else part * sky_over_image[box]).sum() * unit_jy)
         peak = np.unravel_index(np.abs(part).argmax(), part.shape)
         found.append(dict(x=centre[0], y=centre[1], x_peak=int(x[peak[0]]), y_peak=int(y[peak[1]]), flux_jy=flux,
                           flux_error_jy=abs(flux) / max(snr, 1e-30), snr=snr, pixels=int(np.count_nonzero(part)),

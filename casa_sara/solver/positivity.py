@@ -90,7 +90,7 @@ def _asked(ppd, bounds, lobes):
     image, vis = ppd.scratch_image, ppd.scratch_vis
     # what a pixel of 1 changes in its gradient, Σ U w/σ², and the variance of the gradient, Σ U² w/σ²
     image.fill(0)
-    image[0, 0] = 1
+    image[(0, 0) if ppd.sky_over_image is None else tuple(n // 2 for n in image.shape)] = 1  # one that is seen
     ppd.measurement.forward(image, vis)
     power = np.abs(vis)
     power *= power

@@ -236,7 +236,7 @@ class _tsara:
         Opened by specmode = 'cube'.
         Only True: uniform and Briggs weights of a channel are computed from its own visibilities.
 
-    gridder : {'standard', 'wproject'}, default 'standard'
+    gridder : {'standard', 'wproject', 'mosaic'}, default 'standard'
         How the visibilities of the sky are computed:
           'standard'  a two-dimensional Fourier transform, which is accurate in a narrow field. A
                       warning says by how much the w-term would change the phases in the corners of
@@ -247,7 +247,29 @@ class _tsara:
                       of the package ducc0 where they are large. The log says how large they are and
                       which of the two is used. The Fourier transforms take 3 to 70 times as long as
                       with 'standard', longer for larger phases.
+          'mosaic'    one sky, seen by several pointings, each through the primary beams of its antennas.
+                      The fields may be of several MeasurementSets. Primary beams are circular, centred on
+                      PHASE_DIR of FIELD (POINTING is not used, as with usepointing=False in tclean), and
+                      are those of the dishes at both ends of each baseline and of its frequency, in steps
+                      of 2 per cent: for ALMA and the ACA the Airy pattern of 10.7 m (12 m dishes) and of
+                      6.25 m (7 m dishes) with a blockage of 0.75 m, to the first null, mixed baselines
+                      included; for other telescopes the .pb of CASA. The w-term is modelled to first
+                      order around each pointing.
         'wproject' applies to everything: model, .psf, .residual and the model column.
+
+        With 'mosaic' .model is the sky itself. .residual and .image are the sky times .pb, and have the
+        same noise everywhere, as tclean's with normtype='flatnoise'; .image.pbcor and .model.pbcor are the
+        sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
+        .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
+        The model is zero where .pb is below 0.1. The visibilities of a mosaic are not averaged. Not available
+        with 'mosaic': specmode='cube', parallel=True, ndraws, jackknife, report and saracompare.
+
+    onepointing : bool, default False
+        Opened by gridder = 'standard' or 'wproject'.
+        Fields that are farther apart than 0.2 arcsec and one per cent of the primary beam of a 25 m dish
+        are only imaged with gridder='standard' or 'wproject' when this is True. Their primary beams are then
+        not modelled: the flux of a source is a mean of what the fields see of it. gridder='mosaic' models
+        them.
 
     wprojplanes : int, default -1
         Opened by gridder = 'wproject'.
@@ -256,6 +278,17 @@ class _tsara:
         a request for the w-term, and the log says that no planes are used. -1, and 2 or more, are
         accepted. 1, tclean's default, would leave the w-term out, as gridder='standard' does, and is
         refused, as is 0.
+
+    usepointing : {False}, default False
+        Opened by gridder = 'mosaic'.
+        Primary beams are centred on PHASE_DIR of FIELD, as with tclean's default. Pointing directions of
+        single antennas in POINTING cannot be used.
+
+    mosweight : bool, default True
+        Opened by gridder = 'mosaic'.
+        With weighting='uniform' or 'briggs', whether the density of the visibilities is that of each field by
+        itself or, with False, that of all fields together, as in tclean. It acts on .psf, .residual,
+        .weight, .pb and .image, not on the model.
 
     pblimit : float, default 0.2
         Where the primary beam is below this, .pb is zero, and .pb, .residual, .image and the images
@@ -593,14 +626,14 @@ class _tsara:
         intent='', datacolumn='corrected', imagename='', imsize=[100], cell=[], phasecenter='', stokes='I',
         projection='SIN', startmodel='', specmode='mfs', reffreq='', spectralindex='', nchan=-1, start='', width='',
         outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest', perchanweightdensity=True,
-        gridder='standard', wprojplanes=-1, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[],
-        restoration=True, restoringbeam=[], pbcor=False, method='tsara', niter=100000,
-        wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
-        mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
-        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
-        reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, ndraws=0, jackknife=False, blocks=0,
-        nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False,
-        overwrite=False, savemodel='none', parallel=False,
+        gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False, mosweight=True, pblimit=0.2,
+        weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True, restoringbeam=[], pbcor=False,
+        method='tsara', niter=100000, wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'],
+        wavelevels=4, usemask='user', mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt',
+        boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20,
+        reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0,
+        ndraws=0, jackknife=False, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False,
+        report=False, restart=False, overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())

@@ -6,7 +6,7 @@ CASA's own synthesisimager makes them from the selected data, so they are tclean
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -41,6 +41,8 @@ class ImagePlane:
         Name of the source and type of the image.
     miscinfo : dict
         Telescope and distance.
+    sky_model : bool
+        Whether the model is the sky itself, as in a mosaic; else it is the sky times the primary beam.
     masks_all : bool
         Whether .residual and .image have the mask, or only .pb and what is divided by it.
     notes : list of str
@@ -53,12 +55,31 @@ class ImagePlane:
     imageinfo: dict
     miscinfo: dict
     masks_all: bool = True
+    sky_model: bool = False
     notes: list[str] = field(default_factory=list)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Pixels in right ascension and declination."""
         return self.pb.shape[-2:]
+
+    def of_mosaic(self, weight, pblimit):
+        """Return the same plane with the primary beam of a mosaic, √(weight/largest weight) above a limit.
+
+        Parameters
+        ----------
+        weight : real (nx, ny)
+            Weight of the data at each place of the sky.
+        pblimit : float
+            As of :func:`define_image_plane`.
+
+        Returns
+        -------
+        ImagePlane
+        """
+        pb = np.sqrt(weight / weight.max())
+        mask = pb > abs(pblimit)
+        return replace(self, pb=np.where(mask, pb, np.float32(0)), mask=mask, sky_model=True)
 
     @property
     def channels(self) -> int:

@@ -1,5 +1,6 @@
 """What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
-(.mask .image.pbcor .model.pbcor .model.error .image.error .image.jackknife .draws.npz), and the record .sara.json.
+(.mask .image.pbcor .model.pbcor .model.error .image.error .image.jackknife .draws.npz), .weight of a mosaic, and the
+record .sara.json.
 
 They appear together (:mod:`casa_sara.runtime.atomic`), and replace those of an older run of this name together.
 """
@@ -31,7 +32,7 @@ __all__ = [
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-ON_REQUEST = (".mask", ".image.pbcor", ".model.pbcor", ".model.error", ".image.error", ".image.jackknife")
+ON_REQUEST = (".mask", ".weight", ".image.pbcor", ".model.pbcor", ".model.error", ".image.error", ".image.jackknife")
 DRAWS = ".draws.npz"  # of a bootstrap
 CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
@@ -110,7 +111,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
         The image plane: coordinates, primary beam, mask.
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
-        residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'model.error', 'image.error' and
+        residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'weight' of a mosaic, 'model.error', 'image.error' and
         'image.jackknife' where there are; 'draws' is a dict of arrays, kept as `DRAWS`.
     sumwt : float, or one for each channel
         Sum of the imaging weights.
@@ -148,23 +149,35 @@ def write_images(root, plane, images, sumwt, beam, output):
     plane, output = ImagePlane(**plane), Output(**output)
     write_image(root + ".psf", images["psf"], plane, beam=beam)
     write_image(root + ".residual", images["residual"], plane, masked=plane.masks_all)
-    write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
+    seen = images["model"]
+    if plane.sky_model:  # restored is what is seen of it, of flat noise as .residual
+        seen = seen * np.sqrt(images["weight"] / images["weight"].max())
+        write_image(root + ".weight", images["weight"], plane)
+    write_image(root + ".model", seen, plane, unit="Jy/pixel")
     write_image(root + ".pb", plane.pb, plane, masked=True)
     write_image(root + ".sumwt", sumwt.reshape(-1, 1, 1), plane)
     if output.restoringbeam is not None:
         restore(root, output.restoringbeam, "cube" if plane.pb.ndim == 3 else "mfs")
+    if plane.sky_model:
+        shutil.rmtree(root + ".model")
+        write_image(root + ".model", images["model"], plane, unit="Jy/pixel")
     if "mask" in images:
         write_image(root + ".mask", images["mask"], plane)
     if output.pbcor:
-        write_corrected(root, plane, images["model"])
+        write_corrected(root, plane, seen)
+    _write_errors(root, plane, images, beam, output)
+    for path in existing_products(root):
+        with opened("image", path) as ia:
+            ia.sethistory(origin="tsara", history=list(output.history))
+
+
+def _write_errors(root, plane, images, beam, output):
+    """Write the images of errors that there are."""
     if "model.error" in images:
         write_image(root + ".model.error", images["model.error"], plane, unit="Jy/pixel")
     for name in {"image.error", "image.jackknife"} & images.keys():
         restored = restored_beam(list(output.restoringbeam), beam)
         write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored, masked=plane.masks_all)
-    for path in existing_products(root):
-        with opened("image", path) as ia:
-            ia.sethistory(origin="tsara", history=list(output.history))
 
 
 def _not_written(imagename, needed, scratch, error):

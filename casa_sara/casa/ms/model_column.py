@@ -26,6 +26,7 @@ from casa_sara.casa.ms.subtables import readable
 from casa_sara.casa.ms.table_cells import lacking_cells
 from casa_sara.casa.runtime.child_process import ChildError, in_child
 from casa_sara.casa.runtime.tools import opened
+from casa_sara.data.visibilities import RowTable
 from casa_sara.runtime.signals import signals_deferred
 
 __all__ = [
@@ -117,7 +118,7 @@ def _column_bytes(name):
     return 8 * int(rows @ np.array(cells))
 
 
-def write_model_column(selection, phase_center, predict):
+def write_model_column(selection, phase_center, predict, by_row=False):
     """Fill MODEL_DATA of the selected rows and channels, flagged ones too.
 
     The model visibility is the same for both parallel-hand correlations (unpolarised) and 0 for cross-hand ones.
@@ -134,6 +135,8 @@ def write_model_column(selection, phase_center, predict):
     predict : callable
         Takes uvw float64 (3, M) in wavelengths and LSRK frequencies (M,) in Hz, and returns the complex (M,)
         visibilities in Jy of the model image, at the image's phase centre.
+    by_row : bool
+        It takes the `RowTable` of the R rows too, whose M/R channels follow one another.
 
     Raises
     ------
@@ -145,7 +148,7 @@ def write_model_column(selection, phase_center, predict):
             _mark(ms.name)
             with opened("calibrater", ms.name, addcorr=False, addmodel=True) as cb:
                 cb.delmod(otf=True, scr=False)
-            written = _write(ms, Geometry(ms, phase_center), predict)
+            written = _write(ms, Geometry(ms, phase_center), predict, by_row)
             if written != [_checksum(values) for values in _read_back(ms)]:
                 raise RuntimeError(f"{_COLUMN} of '{ms.name}' does not read back as it was written: do not use it")
             os.unlink(os.path.join(ms.name, INCOMPLETE))
@@ -234,7 +237,7 @@ def _corners(group):
     return [0, int(group.channels[0])], [len(group.correlations) - 1, int(group.channels[-1])], [1, 1]
 
 
-def _write(ms, geometry, predict):
+def _write(ms, geometry, predict, by_row):
     """Write all pieces and return their checksums."""
     checksums = []
     with opened("table", ms.name, nomodify=False) as tb:
@@ -246,7 +249,8 @@ def _write(ms, geometry, predict):
                 model = np.zeros((rows.size, group.channels.size), dtype=complex)
                 field, time = part.getcol("FIELD_ID")[usable], part.getcol("TIME")[usable]
                 freq_hz = geometry.frequencies(group, field, time)
-                model[usable] = _at_field_centre(predict, freq_hz,
+                rows_too = [_row_table(ms, group, part, rows, usable)] if by_row else []
+                model[usable] = _at_field_centre(predict, freq_hz, rows_too,
                                                  *geometry.wavelengths(group, field, time, uvw_m[:, usable]))
                 values = part.getcolslice(_COLUMN, *_corners(group))
                 selected = np.zeros((values.shape[0], group.channels.size, rows.size), dtype=complex)
@@ -264,9 +268,19 @@ def _parallel(group):
     return [k for k, name in enumerate(group.correlations) if name in ("I", "RR", "LL", "XX", "YY")]
 
 
-def _at_field_centre(predict, freq_hz, uvw, shift):
+def _row_table(ms, group, part, rows, usable):
+    """Return the RowTable of the usable rows of a piece."""
+    names = {"time": "TIME", "interval": "INTERVAL", "scan": "SCAN_NUMBER", "observation": "OBSERVATION_ID",
+             "field": "FIELD_ID", "antenna1": "ANTENNA1", "antenna2": "ANTENNA2"}
+    columns = {name: part.getcol(column)[usable] for name, column in names.items()}
+    of_group = {name: np.full(np.count_nonzero(usable), value)
+                for name, value in (("ms", ms.number), ("spw", group.spw), ("hands", len(group.hands)))}
+    return RowTable(row=rows[usable], **columns, **of_group)
+
+
+def _at_field_centre(predict, freq_hz, rows_too, uvw, shift):
     """Predict, and turn the visibilities back from the image's phase centre to the field's."""
-    model = np.asarray(predict(uvw.reshape(3, -1), freq_hz.reshape(-1))).reshape(uvw.shape[1:])
+    model = np.asarray(predict(uvw.reshape(3, -1), freq_hz.reshape(-1), *rows_too)).reshape(uvw.shape[1:])
     return model if shift is None else model * np.exp(2j * np.pi * shift)
 
 

@@ -19,7 +19,6 @@ __all__ = ["read_visibilities"]
 
 STOKES = ("I", "Q", "U", "V")
 _CHUNK = 400_000  # complex numbers read at a time
-_ONE_POINTING = 1e-6  # rad; fields closer than this share their primary beam
 _WIDEST_BEAM = 10.0  # degrees; no field is farther from the image's centre
 _ROW_COLUMNS = {
     "time": "TIME",
@@ -112,6 +111,8 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
         freq_range_hz=(float(ranges[:, 0].min()), float(ranges[:, 1].max())),
         spws={ms.number: tuple(sorted({group.spw for group in ms.groups})) for ms in selected},
         observatory=selected[0].observatory,
+        fields={(ms.number, number): on_sky(direction, ms, ms.start_s)
+                for ms in selected for number, direction in ms.fields.items()},
         mixed_weights=any(0 < sum(group.has("WEIGHT_SPECTRUM", group.rows).sum() for group in ms.groups)
                           < sum(group.rows.size for group in ms.groups) for ms in selected),
     )
@@ -326,11 +327,4 @@ def _notes(selected, usable):
     notes += [f"field {number} of '{ms.name}' is in {direction['refer']}: its direction on the sky is "
               "computed for every integration"
               for ms in selected for number, direction in ms.fields.items() if is_of_earth(direction)]
-    centres = [on_sky(direction, ms, ms.start_s) for ms in selected for direction in ms.fields.values()]
-    spread = max(separation(centre, centres[0]) for centre in centres)
-    if spread > _ONE_POINTING:
-        notes.append(
-            f"{len(centres)} fields, up to {np.degrees(spread) * 3600:.1f} arcsec apart, are imaged as one pointing: "
-            "their different primary beams are not modelled"
-        )
     return notes

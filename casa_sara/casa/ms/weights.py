@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 
@@ -92,8 +93,8 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     uniform  w / G
     briggs   w / (G·f² + 1),  f² = (5·10^−robust)² / (ΣG²/ΣG)
 
-    times the Gaussian taper. `npixels` sets the uv cell of uniform and briggs to
-    1/(npixels·cell). Samples beyond the grid have no weight.
+    times the Gaussian taper. With `mosweight`, G is that of each field of a mosaic. `npixels` sets the uv cell of
+    uniform and briggs to 1/(npixels·cell). Samples beyond the grid have no weight.
 
     Parameters
     ----------
@@ -112,28 +113,46 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     """
     if weighting.weighting not in WEIGHTINGS:
         raise ValueError(f"weighting = '{weighting.weighting}' is not one of {', '.join(WEIGHTINGS)}")
+    if grid.is_mosaic and weighting.mosweight and weighting.weighting != "natural":
+        return _weights_by_field(visibilities, grid, replace(weighting, mosweight=False), comm)
     taper = _taper_parameters(weighting.uvtaper)
     weights = visibilities.imaging_weight.copy()
     if weighting.weighting == "natural" and taper is None:
         return weights
     u, v = _field_uv(visibilities, "LSRK")
     if weighting.weighting != "natural":
-        if weighting.npixels > MOST_CELLS:
-            raise ValueError(f"npixels = {weighting.npixels}: should be at most {MOST_CELLS}")
-        shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
-        to_cell = np.rint if grid.is_cube else np.trunc
-        cells = _cells(-u, v, shape, grid.cell_rad, to_cell)
-        counts = comm.allreduce(_count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights,
-                                       shape[0] * shape[1]))
-        if not counts.any():
-            raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
-        density = counts[cells]
-        if weighting.weighting == "briggs":
-            scale = (5.0 * 10.0**-weighting.robust) ** 2 * counts.sum() / np.square(counts).sum()
-            density = np.where(density > 0, density * scale + 1.0, 0.0)
+        density = _density(u, v, weights, grid, weighting, comm)
         weights = np.divide(weights, density, out=np.zeros_like(weights), where=density > 0, casting="same_kind")
     if taper is not None:
         weights *= _taper(u, v, *taper)
+    return weights
+
+
+def _density(u, v, weights, grid, weighting, comm):
+    """Return by what uniform and briggs divide the natural weights, real (M,): 0 beyond the grid."""
+    if weighting.npixels > MOST_CELLS:
+        raise ValueError(f"npixels = {weighting.npixels}: should be at most {MOST_CELLS}")
+    shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
+    to_cell = np.rint if grid.is_cube else np.trunc
+    cells = _cells(-u, v, shape, grid.cell_rad, to_cell)
+    counts = comm.allreduce(_count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights, shape[0] * shape[1]))
+    if not counts.any():
+        raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
+    density = counts[cells]
+    if weighting.weighting == "uniform":
+        return density
+    scale = (5.0 * 10.0**-weighting.robust) ** 2 * counts.sum() / np.square(counts).sum()
+    return np.where(density > 0, density * scale + 1.0, 0.0)
+
+
+def _weights_by_field(visibilities, grid, weighting, comm):
+    """Return the imaging weights of every field by itself, float32 (M,)."""
+    rows, weights = visibilities.rows, np.empty(visibilities.size, np.float32)
+    fields = int(comm.largest(int(rows.field.max(initial=0)))) + 1
+    field = (rows.ms.astype(np.int64) * fields + rows.field)[visibilities.row]
+    for number in np.unique(np.concatenate(comm.allgather(np.unique(field)))):
+        here = np.flatnonzero(field == number)
+        weights[here] = imaging_weights(visibilities.part(here), grid, weighting, comm)
     return weights
 
 
