@@ -1,6 +1,7 @@
 """Mosaics: operator against explicit sums, beams and weights against Airy patterns and tclean, sources recovered."""
 
 import os
+import signal
 
 import numpy as np
 import pytest
@@ -166,6 +167,8 @@ casatools = pytest.importorskip("casatools")
 from casa_sara import tsara
 from casa_sara.casa.images.primary_beams import primary_beams
 from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.runtime import log
+from casa_sara.solver.record import STOPPED_BY_USER
 
 GRID = dict(imsize=[240, 216], cell="0.9arcsec", gridder="mosaic", phasecenter=AT_CENTRE, datacolumn="data")
 SKY = [(0.3, 0.0, 0.0), (0.25, 22 * ARCSEC, 13.5 * ARCSEC), (1.0, -52.5 * ARCSEC, -43.3 * ARCSEC),
@@ -332,6 +335,26 @@ def test_startmodel_is_the_sky(mixed, tmp_path, monkeypatch):
     tsara(imagename="twice", **options | dict(startmodel="once.model", niter=1))
     one, other = pixels("once.model"), pixels("twice.model")
     assert np.linalg.norm(one - other) < 0.35 * np.linalg.norm(one)  # it began there
+
+
+@pytest.mark.slow
+def test_restart_goes_on_to_the_same_sky(mixed, tmp_path, monkeypatch):
+    """Stopped in the middle, to the last bit."""
+    monkeypatch.chdir(tmp_path)
+    options = GRID | dict(vis=mixed, wavelets=["dirac", "db2"], nthreads=1, niter=100)
+    tsara(imagename="once", **options)
+
+    class Progress(log.Progress):
+        def __call__(self, iteration, *others):
+            if iteration == 50:
+                os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(log, "Progress", Progress)
+        assert tsara(imagename="twice", **options)["stopcode"] == STOPPED_BY_USER
+    assert tsara(imagename="twice", restart=True, **options)["sara"]["resumed"] == [50]
+    for product in ("model", "residual", "weight"):
+        np.testing.assert_array_equal(pixels("twice." + product), pixels("once." + product))
 
 
 def test_model_column_is_the_sky_through_the_beams(folder, tmp_path, monkeypatch):
