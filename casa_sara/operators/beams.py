@@ -211,7 +211,7 @@ def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarr
     weights = mosaic.sums(beam_of_sample, weight)
     step = max(1, max(mosaic.shape) // COARSE)
     x, y = np.arange(0, mosaic.shape[0], step)[:, None], np.arange(0, mosaic.shape[1], step)[None, :]
-    gains = np.array([beam.at(x, y, mosaic.cell_rad).ravel() for beam in mosaic.beams])
+    gains = np.array([beam.at(x, y, mosaic.cell_rad).ravel().astype(np.float32) for beam in mosaic.beams])
     sensitivity_sq = weights @ gains**2 / weights.sum()
     gains = gains[:, sensitivity_sq > 0] / np.sqrt(sensitivity_sq[sensitivity_sq > 0])
     overlap = gains @ gains.T / gains.shape[1]

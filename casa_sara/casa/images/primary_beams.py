@@ -110,14 +110,22 @@ def primary_beams(data, selection, grid, profiles=None):
     if profiles is None:
         _check_fields(data)
         profiles = Profiles(_bands(data.freq_hz, data.weight), [], np.zeros(0), np.zeros((0, PROFILE), np.float32))
-    band = np.abs(np.log(np.asarray(data.freq_hz, float)[:, None] / profiles.bands_hz)).argmin(axis=1)
-    smaller, larger = np.sort(dish_of_row, axis=0)[:, data.row]
-    key = np.stack([pointing_of_row[data.row], larger, smaller, band])
-    beams, beam_of_sample = np.unique(key, axis=1, return_inverse=True)
+    smaller, larger = np.sort(dish_of_row, axis=0)
+    sizes = len(centres), len(dishes), len(dishes), len(profiles.bands_hz)
+    of_row = np.ravel_multi_index((pointing_of_row, larger, smaller), sizes[:3])
+    number = of_row[data.row] * sizes[3] + _nearest_band(data.freq_hz, profiles.bands_hz)
+    used, beam_of_sample = np.unique(number, return_inverse=True)
+    beams = np.array(np.unravel_index(used, sizes))
     wanted = [(dishes[k][0], dishes[k][1], dishes[n][1], int(number)) for _, k, n, number in beams.T.tolist()]
     profiles = _with_kinds(profiles, sorted(set(wanted)), data, selection, grid)
     beams = np.stack([beams[0], [profiles.kinds.index(kind) for kind in wanted]], axis=1)
     return PrimaryBeams(centres, profiles, beams, beam_of_sample.ravel().astype(np.int32))
+
+
+def _nearest_band(freq_hz, bands_hz):
+    """Return the number of the nearest of some frequencies, int (M,)."""
+    distinct, of_sample = np.unique(np.asarray(freq_hz, float), return_inverse=True)
+    return np.abs(np.log(distinct[:, None] / bands_hz)).argmin(axis=1)[of_sample.ravel()]
 
 
 def _with_kinds(profiles, kinds, data, selection, grid):
