@@ -17,6 +17,7 @@ import numpy.typing as npt
 from scipy.ndimage import maximum_filter
 
 from casa_sara.operators import _wavelet_kernels as kernels, _wavelet_lines as lines
+from casa_sara.operators._arguments import checked
 from casa_sara.operators._coefficient_layout import (
     aligned,
     approximations,
@@ -289,10 +290,7 @@ class SaraDictionary:
             coefs[band.slice][where] *= self.dtype.type(factor)
 
     def _checked(self, array, name, shape):
-        if not isinstance(array, np.ndarray) or array.shape != shape or array.dtype != self.dtype \
-                or not array.flags.c_contiguous:
-            raise ValueError(f"{name} must be a C-contiguous {self.dtype} array of shape {shape}")
-        return array
+        return checked(array, name, shape, self.dtype)
 
     def _job(self, coefs, mode, weights=None):
         target = kernels.Target(coefs, coefs if weights is None else weights, self._params, mode)

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from casa_sara.operators._arguments import for_adjoint, for_forward
 from casa_sara.operators._decimation_kernels import decimate, expand, expand_rows, scratch_shape
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.decimation import AxisDecimation, separable
@@ -131,9 +132,7 @@ class MeasurementOperator:
         -------
         complex (M,)
         """
-        image = _checked(np.ascontiguousarray(image, self.dtype), "image", self.shape, self.dtype)
-        out = np.empty(self.size, self.complex_dtype) if out is None else out
-        _checked(out, "out", (self.size,), self.complex_dtype)
+        image, out = for_forward(self, image, out)
         self._nufft.clear()
         self.workers.run(decimate, image, self._rows, self._columns, self._nufft.grid, self._lines, self._scratch)
         self._nufft.to_points(out)
@@ -155,9 +154,7 @@ class MeasurementOperator:
         -------
         real (nx, ny)
         """
-        vis = _checked(np.ascontiguousarray(vis, self.complex_dtype), "vis", (self.size,), self.complex_dtype)
-        out = np.empty(self.shape, self.dtype) if out is None else out
-        _checked(out, "out", self.shape, self.dtype)
+        vis, out = for_adjoint(self, vis, out)
         self._nufft.from_points(vis)
         self.workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
         self.workers.run(expand_rows, self._lines, self._rows, out)
@@ -348,12 +345,6 @@ def _cycles_per_pixel(uv, cell_rad):
     """Baselines (2, M) as frequencies along the image axes."""
     check_cell(uv, cell_rad)
     return uv * (np.broadcast_to(np.asarray(cell_rad, dtype=np.float64), (2,))[:, None] * [[-1.0], [1.0]])
-
-
-def _checked(array, name, shape, dtype):
-    if array.shape != shape or array.dtype != dtype or not array.flags.c_contiguous:
-        raise ValueError(f"{name} must be a C-contiguous {dtype} array of shape {shape}")
-    return array
 
 
 def choose_eps(vis: np.ndarray, weight: np.ndarray, dtype: npt.DTypeLike = np.float32,

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import iv, jv
 
+from casa_sara.operators._arguments import for_adjoint, for_forward
 from casa_sara.runtime import jit
 
 __all__ = ["ModulatedOperator", "bessel_factors", "terms_needed"]
@@ -70,10 +71,7 @@ class ModulatedOperator:
         -------
         complex (M,)
         """
-        image = np.ascontiguousarray(image, self.dtype)
-        out = np.empty(self.size, self.complex_dtype) if out is None else out
-        if image.shape != self.shape or out.shape != (self.size,) or out.dtype != self.complex_dtype:
-            raise ValueError(f"an image of shape {self.shape} and {self.complex_dtype} out ({self.size},) are needed")
+        image, out = for_forward(self, image, out)
         run = self.workers.run
         for order, (turn, factor) in enumerate(zip(self._turns, self._factors)):
             run(_advance, order, self._place, self._polynomial, self._previous)
@@ -97,10 +95,7 @@ class ModulatedOperator:
         -------
         real (nx, ny)
         """
-        vis = np.ascontiguousarray(vis, self.complex_dtype)
-        out = np.empty(self.shape, self.dtype) if out is None else out
-        if vis.shape != (self.size,) or out.shape != self.shape or out.dtype != self.dtype:
-            raise ValueError(f"vis ({self.size},) and {self.dtype} out of shape {self.shape} are needed")
+        vis, out = for_adjoint(self, vis, out)
         run = self.workers.run
         for order, (turn, factor) in enumerate(zip(self._turns, self._factors)):
             run(_take_term, np.conj(turn), factor, self._rotation, vis, self._vis)

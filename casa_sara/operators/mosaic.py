@@ -18,6 +18,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from casa_sara.operators._arguments import for_adjoint, for_forward
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.beams import Mosaic, beam_at
 from casa_sara.operators.measurement import MeasurementOperator, share_work_space
@@ -78,10 +79,7 @@ class MosaicOperator:
         -------
         complex (M,)
         """
-        image = np.ascontiguousarray(image, self.dtype)
-        out = np.empty(self.size, self.complex_dtype) if out is None else out
-        if image.shape != self.shape or out.shape != (self.size,) or out.dtype != self.complex_dtype:
-            raise ValueError(f"an image of shape {self.shape} and {self.complex_dtype} out ({self.size},) are needed")
+        image, out = for_forward(self, image, out)
         if self._over is not None:
             image = np.multiply(image, self._over, out=self._image)
         for part in self._parts:
@@ -105,10 +103,7 @@ class MosaicOperator:
         -------
         real (nx, ny)
         """
-        vis = np.ascontiguousarray(vis, self.complex_dtype)
-        out = np.empty(self.shape, self.dtype) if out is None else out
-        if vis.shape != (self.size,) or out.shape != self.shape or out.dtype != self.dtype:
-            raise ValueError(f"vis ({self.size},) and {self.dtype} out of shape {self.shape} are needed")
+        vis, out = for_adjoint(self, vis, out)
         out.fill(0)
         for part in self._parts:
             pixels, own = part.space(self._pixels, self._vis)
