@@ -243,7 +243,7 @@ def test_cells_are_halved_where_the_first_image_is_too_bright_for_them():
     told = []
     found = reconstruct(samples, GRID, replace(OPTIONS, niter=3), control=Control(tell=told.append))
     assert found.averaging["halvings"] == [1, 1] and found.averaging["largest_error"] < 1
-    assert f"24000 visibilities are averaged to {found.averaging['averages']}," in told[0]
+    assert f"24000 visibilities are averaged to {found.averaging['averages']} for the solver," in told[0]
     assert "2 times smaller" in told[0]
 
 

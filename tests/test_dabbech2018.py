@@ -22,7 +22,8 @@ from casa_sara.options import SARA_BASES, ImageGrid, SolverOptions
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.paper_method import block_norms
 from casa_sara.reconstruction.problem import Problem, Samples
-from casa_sara.reconstruction.reconstruct import Control, reconstruct, schedule_of
+from casa_sara.reconstruction.reconstruct import Control, reconstruct
+from casa_sara.reconstruction.settings import schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperSchedule, PaperStage, run_paper_algorithm_2
 from casa_sara.solver.paperprior import RELAXATION, PaperPrior

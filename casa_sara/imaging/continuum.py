@@ -33,6 +33,7 @@ from casa_sara.imaging.data_quality import (
 )
 from casa_sara.imaging.dry_run import forecast_run
 from casa_sara.imaging.error_images import error_images
+from casa_sara.imaging.island_list import list_islands
 from casa_sara.imaging.mosaic import check_pointings, weight_image, with_beams
 from casa_sara.imaging.plane_images import plane_images, point_spread
 from casa_sara.imaging.predict_model import save_model
@@ -41,7 +42,6 @@ from casa_sara.imaging.run_solver import (
     checkpoint_of,
     density_of,
     expected_iterations,
-    list_islands,
     solve_image,
     without_wild,
 )
@@ -51,7 +51,8 @@ from casa_sara.options import ImageGrid, ImagingRequest
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
-from casa_sara.reconstruction.reconstruct import Reconstruction, operator_accuracy
+from casa_sara.reconstruction.result import Reconstruction
+from casa_sara.reconstruction.settings import operator_accuracy
 from casa_sara.runtime.deadline import Deadline
 
 __all__ = [

@@ -19,14 +19,15 @@ from casa_sara.imaging.continuum import Result, describe, split
 from casa_sara.imaging.cube_checkpoint import CubeCheckpoint
 from casa_sara.imaging.data_quality import image_limits, nowhere_visible
 from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.island_list import list_islands
 from casa_sara.imaging.mosaic import check_pointings
 from casa_sara.imaging.plane_images import plane_images
-from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, list_islands, solve_image, without_wild
+from casa_sara.imaging.run_solver import Watch, checkpoint_of, density_of, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace, writing_seconds
 from casa_sara.options import ImagingRequest
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
-from casa_sara.reconstruction.reconstruct import check_l2bound, schedule_of
+from casa_sara.reconstruction.settings import check_l2bound, schedule_of
 from casa_sara.runtime.deadline import Deadline
 from casa_sara.runtime.signals import stop_on_interrupt
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, UNFINISHED

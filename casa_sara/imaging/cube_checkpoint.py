@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 
-from casa_sara.reconstruction.reconstruct import Reconstruction
+from casa_sara.reconstruction.result import Reconstruction
 
 __all__ = ["CubeCheckpoint"]
 

@@ -13,7 +13,7 @@ from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, DRAW_REWEIGHTINGS, MOST_GROUPS
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
 from casa_sara.reconstruction.problem import Problem, Samples
-from casa_sara.reconstruction.reconstruct import operator_accuracy, schedule_of
+from casa_sara.reconstruction.settings import operator_accuracy, schedule_of
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.nnls import NNLS_ITERATIONS, NNLSFit, nnls
 

@@ -103,12 +103,12 @@ class FlatNoise:
 
         Parameters
         ----------
-        found : casa_sara.reconstruction.reconstruct.Reconstruction
+        found : casa_sara.reconstruction.result.Reconstruction
             That of x.
 
         Returns
         -------
-        casa_sara.reconstruction.reconstruct.Reconstruction
+        casa_sara.reconstruction.result.Reconstruction
         """
         largest = float(self.sensitivity.max())
         sky = np.divide(found.model, self.sensitivity, out=np.zeros_like(found.model), where=self.sensitivity > 0)

@@ -242,7 +242,8 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
                            NNLSFit(positivity=options.positivity), stopped, problem.support)
         residual = left if problem.averaged is None else problem.averaged.residual(first)
         error = _averaging_error(problem, residual, left, comm)
-        if error.max() > LARGEST_ERROR and finer.max() < MOST_HALVINGS:  # it goes with the square of the side
+        if error.max() > LARGEST_ERROR and finer.max() < MOST_HALVINGS and not stopped():
+            # it goes with the square of the side
             finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
             continue
         found = find_wild(samples.data, samples.offsets, residual, problem.flux_jy(first), comm)
