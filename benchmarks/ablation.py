@@ -56,20 +56,21 @@ FACTOR, LEAST = 2.0, 0.01  # times the largest scatter, and times this (dB, %), 
 def rules() -> dict[str, dict]:
     """Every rule: what of the package is replaced by what."""
     from casa_sara.data.outliers import WildSamples
-    from casa_sara.reconstruction import problem, reconstruct
+    from casa_sara.reconstruction import problem, reconstruct, solution
     from casa_sara.solver import l1_weights
     from casa_sara.solver.nnls import NNLS_ITERATIONS
     from casa_sara.solver.point_sources import PointSources
 
-    schedule, iteration = reconstruct.schedule_of, reconstruct.AdaptivePPD
+    schedule, iteration = reconstruct.schedule_of, solution.AdaptivePPD
     reweight, shares, no_samples = l1_weights.reweight, l1_weights._shares, WildSamples(*np.zeros((3, 0), int))
     undivided = lambda ppd, bounds, scale, confined: reweight(ppd, bounds, scale, False)
     no_points = lambda filter_, gradient, model, support, allowed, significance: (support, PointSources())
-    asked = lambda level: {"reconstruction.schedule_of": lambda options: replace(schedule(options), significance=level)}
+    asked = lambda level: {"reconstruction.reconstruct.schedule_of":
+                           lambda options: replace(schedule(options), significance=level)}
     return {
         "nothing": {},
-        "79 of NNLS": {"problem.nnls": partial(problem.nnls, max_iter=NNLS_ITERATIONS - 1)},
-        "81 of NNLS": {"problem.nnls": partial(problem.nnls, max_iter=NNLS_ITERATIONS + 1)},
+        "79 of NNLS": {"reconstruction.problem.nnls": _nnls_of(problem.nnls, NNLS_ITERATIONS - 1)},
+        "81 of NNLS": {"reconstruction.problem.nnls": _nnls_of(problem.nnls, NNLS_ITERATIONS + 1)},
         "other noise drawn": {"solver.l1_weights.band_noise": partial(l1_weights.band_noise, seed=1)},
         "release": {"solver.positivity.Release.update": lambda self, ppd, bounds: 0},
         "damping": {"solver.reweighting._damp": lambda ppd, residual_norms: None},
@@ -77,8 +78,8 @@ def rules() -> dict[str, dict]:
         "steadiness": {"solver.reweighting._is_steady": lambda residual_norms, interval: True},
         "patience": {"solver.reweighting.PATIENCE": 10**9},
         "nearly": {"solver.reweighting.NEARLY": 1.0},
-        "wild": {"problem.find_wild": lambda *data: no_samples},
-        "over-relaxation": {"reconstruction.AdaptivePPD": partial(iteration, relaxation=1.0)},
+        "wild": {"reconstruction.problem.find_wild": lambda *data: no_samples},
+        "over-relaxation": {"reconstruction.solution.AdaptivePPD": partial(iteration, relaxation=1.0)},
         "neighbours": {"operators.dictionary.SaraDictionary.reweight": _reweight_alone},
         "points": {"solver.significance.unresolved": no_points},
         "prior on points": {"solver.l1_weights.POINTS": 1.0},
@@ -94,6 +95,12 @@ def rules() -> dict[str, dict]:
         "significance 4": asked(4.0),
         "significance 0": asked(0.0),
     }
+
+
+def _nnls_of(nnls, iterations):
+    """The NNLS fit with another number of iterations."""
+    return lambda measurement, vis, precond, norm_sq, fit, *others: nnls(
+        measurement, vis, precond, norm_sq, replace(fit, max_iter=iterations), *others)
 
 
 def _reweight_alone(self, image, alpha, scale, out):
