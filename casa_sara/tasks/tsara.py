@@ -590,9 +590,10 @@ class _tsara:
       108 converged but the residual is not noise (more than 5 sigma over a beam or more).
       The key 'sara' holds its own record: the islands of emission ('islands': place, flux with its
       error, S/N, size; with ndraws bootstrap_error_jy, the error that the draws give; with
-      jackknife jackknife_error_jy), the largest
-      S/N of the residual by width ('residual_snr'), the noise and bound of each block with its
-      snapshot ('blocks'), the history of re-weightings and iterations, the parameters that were
+      jackknife jackknife_error_jy), the largest S/N of the residual by width ('residual_snr'), the
+      noise and bound of each block with its snapshot ('blocks'), to how many averages the
+      visibilities were reduced for the solver, in uv cells of which size ('averaging', empty where
+      they were not), the history of re-weightings and iterations, the parameters that were
       chosen automatically and why, how many samples were left out for which reason ('dropped'), and
       the iterations from which the run was resumed ('resumed').
 
