@@ -188,7 +188,7 @@ def beyond_baselines(model, cell_rad, shortest):
 def image_limits(data, grid, comm=SERIAL):
     """Return warnings about this image plane and these baselines; raise where no image can be made of them."""
     notes = []
-    reach = [[comm.largest(float(np.abs(axis).max(initial=0)))] for axis in data.uvw[:2]]
+    reach = [[comm.largest(longest)] for longest in data.reach[:2]]
     max_uv, max_w = comm.largest(data.max_uv), comm.largest(data.max_w)
     check_cell(np.array(reach), grid.cell_rad)
     check_field(max_uv, grid.shape, grid.cell_rad)
