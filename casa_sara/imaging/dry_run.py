@@ -20,6 +20,7 @@ from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.imaging.load_balance import assign_ranks
 from casa_sara.imaging.memory_forecast import Workload, forecast
 from casa_sara.imaging.mosaic import check_pointings, with_beams
+from casa_sara.imaging.spectra import divided_by_band, with_subbands
 from casa_sara.imaging.time_forecast import measure
 from casa_sara.operators.measurement import check_field
 from casa_sara.parallel.serial import SERIAL
@@ -111,16 +112,19 @@ def dry_run(selection, grid, options, blocks, limits):
             log.warn(str(error))
             return found.summary() | {"reason": str(error)}
     start = time.perf_counter()
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex) or grid.is_mosaic)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, grid.needs_frequencies)
     check_pointings(data, grid)
     if grid.is_mosaic:
         data, grid = with_beams(data, selection, grid)
     if grid.spectralindex:
         grid = with_spectrum(grid, define_image_plane(data, selection, grid))
+    if grid.nterms > 1:
+        grid = with_subbands(grid, data, define_image_plane(data, selection, grid))
     everything = data.size
     if grid.is_cube:
         data = _fullest_channel(data, selection, grid)
-    data, offsets = sort_into_blocks(data, divide(data, blocks)[0])
+    block_of_sample, _ = divided_by_band(*divide(data, blocks), data, grid.subbands)
+    data, offsets = sort_into_blocks(data, block_of_sample)
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
     timing = replace(timing, channels=max(found.workload.channels, 1))
     for line in _time_lines(timing):

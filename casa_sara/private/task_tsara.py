@@ -39,12 +39,14 @@ from casa_sara.version import __version__
 __all__ = ["selection_of", "tsara"]
 
 ARCSEC = math.pi / 180 / 3600
+MOST_TERMS = 6
 
 
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     _check_method(parameters)
     _refuse_for_mosaics(parameters)
+    _refuse_for_spectra(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -132,7 +134,8 @@ def _grid(parameters):
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
                      spectralindex=_spectral_index(parameters), usemask=parameters["usemask"], mask=_mask(parameters),
-                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], **_spectral(parameters))
+                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], nterms=parameters["nterms"],
+                     **_spectral(parameters))
 
 
 def _spectral_index(parameters):
@@ -204,6 +207,27 @@ def _refuse_for_mosaics(parameters):
                                 ("jackknife", False, "errors by jackknife are of single pointings only")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
+
+
+def _refuse_for_spectra(parameters):
+    """Raise on parameters that unknown spectra do not have."""
+    nterms = parameters["nterms"]
+    if not 1 <= nterms <= MOST_TERMS:
+        raise ValueError(f"nterms = {nterms}: should be from 1 to {MOST_TERMS}")
+    if nterms == 1:
+        return
+    for name, right, reason in (("gridder", "standard", "other operators are of flat, or of known spectra"),
+                                ("method", "tsara", "the paper's method has one image"),
+                                ("stokes", "I", "spectra are those of the brightness"),
+                                ("positivity", True, "the brightness is positive at all frequencies"),
+                                ("spectralindex", "", "either the index is known, or it is solved for"),
+                                ("parallel", False, "spectra take one process"),
+                                ("report", False, "reports are made of one image"),
+                                ("savemodel", "none", "MODEL_DATA is written of one image"),
+                                ("ndraws", 0, "errors by bootstrap are of one image"),
+                                ("jackknife", False, "errors by jackknife are of one image")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 
 
 def _check_stokes(parameters):

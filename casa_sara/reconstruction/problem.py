@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ ROUNDS = 6  # of leaving out wild samples, and of another first image
 LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
 MOST_HALVINGS = 8  # what is still wrong in cells 256 times smaller is not due to them
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
+STEEPEST = 2.0  # spectral index for which averages over frequency are made, where it is not known
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
@@ -103,7 +105,7 @@ class Problem:
 
     `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
     `samples` where that is None. `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image
-    times `sky_over_image`.
+    times `sky_over_image`; with `subbands` the images of several frequencies are stacked.
     """
 
     samples: Samples
@@ -116,6 +118,7 @@ class Problem:
     support: np.ndarray | None = None
     averaged: Averaged | None = None
     sky_over_image: np.ndarray | None = None
+    subbands: Any = None
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - four have a default
@@ -170,9 +173,11 @@ class Problem:
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
             data_norm_sq = float(comm.bcast(power_method(
-                lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32)))
+                lambda image: whole.adjoint(precond * whole.forward(image)), measurement.shape, dtype=np.float32)))
+        if support is not None and grid.subbands is not None:
+            support = np.tile(support, (grid.subbands.count, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
-                   grid.mosaic and grid.mosaic.over)
+                   grid.mosaic and grid.mosaic.over, grid.subbands)
 
     def flux_jy(self, image: np.ndarray) -> float:
         """Return Σ|I| of the sky of an image, which no visibility of it exceeds.
@@ -186,6 +191,9 @@ class Problem:
         -------
         float
         """
+        if self.subbands is not None:
+            fluxes = np.abs(self.subbands.split(image)).sum(axis=(1, 2), dtype=float)
+            return self.unit_jy * float((np.abs(self.subbands.factors(self.subbands.band_hz)).T @ fluxes).max())
         sky = image if self.sky_over_image is None else image * self.sky_over_image
         return self.unit_jy * float(np.abs(sky).sum(dtype=float))
 
@@ -204,6 +212,8 @@ def averaging_cell(grid: ImageGrid) -> np.ndarray:
         Along v, u, w and ln ν.
     """
     index = 0.0 if grid.spectrum is None else float(np.abs(grid.spectrum.index).max())
+    if grid.subbands is not None:
+        index = STEEPEST
     depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
     return cell_sides(grid.shape, grid.cell_rad, depth, index)
 
