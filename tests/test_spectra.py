@@ -1,6 +1,8 @@
 """Unknown spectra: frequencies, operator and prior against explicit sums and matrices, and whole runs."""
 
 import os
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ from casa_sara.imaging.spectra import LARGEST_ERROR, spectral_index
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.subbands import SubbandDictionary, Subbands
-from casa_sara.options import Comparing, ImageGrid, Selection
+from casa_sara.options import Comparing, ImageGrid, Selection, SolverOptions
+from casa_sara.reconstruction.problem import Problem, Samples
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l1_weights import first_weights
 from casa_sara.solver.l2_bounds import AdaptiveBounds
@@ -81,6 +84,23 @@ def test_equals_the_sum_over_frequencies(dtype, eps):
     back = rng.standard_normal(SIZE) + 1j * rng.standard_normal(SIZE)
     products = np.vdot(found, back).real, np.vdot(image, operator.adjoint(back))
     assert abs(products[0] - products[1]) < 20 * eps * np.linalg.norm(found) * np.linalg.norm(back)
+
+
+@pytest.mark.parametrize("nterms", [2, 3])
+def test_the_edges_of_the_band_slow_nothing_down(nterms):
+    """Where in the uv plane there are but frequencies of one edge, the steps are as long as elsewhere."""
+    rng, size, grid = np.random.default_rng(4), 4000, ImageGrid((32, 32), (1e-5, 1e-5))
+    freq_hz = rng.uniform(1e9, 2e9, size)
+    baseline = rng.uniform(0.02, 0.24, size) / 1e-5  # wavelengths at 1 GHz: beyond half of the longest, high ones alone
+    uvw = np.array([*baseline * freq_hz / 1e9 * [np.cos(turn := rng.uniform(0, 6.28, size)), np.sin(turn)],
+                    np.zeros(size)])
+    ones = np.ones(size, np.float32)
+    data = SimpleNamespace(vis=ones.astype(np.complex64), weight=ones, uvw=uvw, freq_hz=freq_hz, size=size, beam=None)
+    density = np.histogram2d(*uvw[:2], 32, [[-5e4, 5e4]] * 2)[0][tuple(np.floor((uvw[:2] + 5e4) / 3125).astype(int))]
+    samples = Samples(data, np.array([0, size]), density)
+    norms = [Problem.of(samples, replace(grid, subbands=subbands), SolverOptions(averaging=False), 1.0, 1e-4).data_norm_sq
+             for subbands in (None, Subbands.of(freq_hz, ones, nterms, 1.5e9))]
+    assert norms[1] < 1.7 * norms[0]
 
 
 def small_prior(nterms, shape=(4, 4), dtype=np.float64):

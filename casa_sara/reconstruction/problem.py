@@ -158,7 +158,7 @@ class Problem:
         vis, offsets = data.vis * root_weight, samples.offsets
         measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy),
                                beam=data.beam)
-        precond = _preconditioner(samples, options.precondition, comm)
+        precond = _preconditioner(samples, options.precondition, comm, grid.subbands)
         averaged = None
         if options.averages and grid.mosaic is None:
             with suppress(OverflowError):  # hardly two samples share one of so many cells
@@ -291,15 +291,20 @@ def _told_of_all(found, samples, layout, comm):
     return [told for _, told in sorted(sum(comm.allgather(list(numbered)), []), key=lambda one: one[0])]
 
 
-def _preconditioner(samples, wanted, comm):
+def _preconditioner(samples, wanted, comm, subbands=None):
     """U = 1/density, largest value 1.
 
     Samples of very low weight that are alone in their uv cells (bad data that were down-weighted instead of flagged)
     are not raised to the weight of other cells: the density is taken to be at least 1e-2·Σw²/Σw.
+
+    Of several frequencies it is that times Σ_t g_t², g_t what each image contributes to the sample: where in the uv
+    plane there are but samples of the edges of the band, these would weigh up to T² times as much as the others.
     """
     weight = samples.data.weight
     if not wanted:
         return np.ones(weight.size, np.float32)
     mean = comm.total(float(np.square(weight, dtype=float).sum())) / comm.total(float(weight.sum(dtype=float)))
     precond = 1.0 / np.maximum(np.asarray(samples.density, float), LIGHT * mean)
+    if subbands is not None:
+        precond /= np.square(subbands.factors(samples.data.freq_hz)).sum(axis=0)
     return (precond / comm.largest(precond.max(initial=0))).astype(np.float32)
