@@ -159,18 +159,9 @@ def _refuse_for_cubes(parameters):
     """Raise on parameters that are for continuum images only."""
     if parameters["specmode"] != "cube":
         return
-    if parameters["savemodel"] != "none":
-        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': MODEL_DATA is written "
-                         "from continuum images only; should be 'none'")
     if parameters["parallel"]:
         raise ValueError("parallel = True with specmode = 'cube': only continuum images can be shared by several "
                          "processes; should be False. Channels can be divided among several runs with start and nchan")
-    if parameters["stokes"] != "I":
-        raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes can only be made in "
-                         "Stokes I; should be 'I'")
-    if parameters["usemask"] == "pb" or parameters["mask"]:
-        raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': "
-                         "masks can only be used for continuum images; should be usemask = 'user', mask = ''")
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
