@@ -1,7 +1,6 @@
 """Spectral cubes: tclean's axis and dirty cube, lines recovered, channels kept through a stop, and what is refused."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -263,7 +262,6 @@ def test_dry_run_counts_the_channels(line):
     (dict(perchanweightdensity=False), "perchanweightdensity = False"),
     (dict(reffreq="1.42GHz"), "reffreq = '1.42GHz' has no effect with specmode = 'cube'"),
     (dict(specmode="mfs", nchan=3), "nchan = 3 has no effect with specmode = 'mfs'"),
-    (dict(report=True), "report = True with specmode = 'cube'"),
     (dict(weighting="briggs", npixels=4), "npixels = 4 with specmode = 'cube'"),
     (dict(databound="fixed", l2bound=[1.0, 1.1, 1.2, 1.3]), r"channel 0, .*l2bound = .*there are 1 blocks"),
 ])  # fmt: skip
@@ -274,11 +272,3 @@ def test_refusals(line, options, words):
 
 def test_channel_numbers_may_be_text():
     assert [channel_number(value, "start") for value in ("", 3, "3", "-2", "1.4GHz")] == ["", 3, 3, -2, "1.4GHz"]
-
-
-def test_comparison_refuses_a_cube(solved):
-    from casa_sara import saracompare
-
-    shutil.copytree(solved[0] + ".model", "cube.model")
-    with pytest.raises(ValueError, match=r"models = 'cube.model' has the shape \[64, 60, 1, 4\]"):
-        saracompare(models=["cube", "cube"], outdir="out")

@@ -9,6 +9,7 @@ from casa_sara.casa.images.products import check_imagename, write_images, write_
 from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.runtime import log
 from casa_sara.casa.runtime.child_process import waiting_child
+from casa_sara.imaging.continuum import after_iterations
 from casa_sara.imaging.cube_checkpoint import CubeCheckpoint
 from casa_sara.imaging.cube_planes import Channel, CubePlanes, Tally
 from casa_sara.imaging.data_quality import image_limits
@@ -84,7 +85,8 @@ def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | No
     if request.options.niter > 0:
         checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, channels=cube.order,
                             support=cube.support)
-        deadline.reserve = cube.plane.channels * writing_seconds(0, grid.shape) + writing_seconds(data.size, (0,))
+        deadline.reserve = cube.plane.channels * writing_seconds(0, grid.shape) + after_iterations(
+            data.size, (0,), output, request.limits, deadline.elapsed())
         stopped = _solve_channels(cube, checkpoint, deadline)
     # write
     tally = Tally(data.size, data.dropped, tuple(data.notes))

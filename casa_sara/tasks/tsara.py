@@ -551,7 +551,9 @@ class _tsara:
     report : bool, default False
         True writes a page with the images, residuals with natural and Briggs weights, convergence, the
         noise found in every snapshot, and all numbers: imagename.report/report.html, and its pictures
-        beside it. The task saracompare writes the same for several images.
+        beside it. Of a cube it shows the spectrum, the maps of the line, all channels with their
+        residuals, and noise and islands of each. The task saracompare writes the same for several
+        images.
 
     restart : bool, default False
         True continues a run that was killed, was stopped with Ctrl-C, or whose machine went down. It
