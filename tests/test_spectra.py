@@ -98,8 +98,9 @@ def test_the_edges_of_the_band_slow_nothing_down(nterms):
     data = SimpleNamespace(vis=ones.astype(np.complex64), weight=ones, uvw=uvw, freq_hz=freq_hz, size=size, beam=None)
     density = np.histogram2d(*uvw[:2], 32, [[-5e4, 5e4]] * 2)[0][tuple(np.floor((uvw[:2] + 5e4) / 3125).astype(int))]
     samples = Samples(data, np.array([0, size]), density)
-    norms = [Problem.of(samples, replace(grid, subbands=subbands), SolverOptions(averaging=False), 1.0, 1e-4).data_norm_sq
-             for subbands in (None, Subbands.of(freq_hz, ones, nterms, 1.5e9))]
+    norms, options = [], SolverOptions(averaging=False)
+    for subbands in (None, Subbands.of(freq_hz, ones, nterms, 1.5e9)):
+        norms.append(Problem.of(samples, replace(grid, subbands=subbands), options, 1.0, 1e-4).data_norm_sq)
     assert norms[1] < 1.7 * norms[0]
 
 
