@@ -23,6 +23,7 @@ from casa_sara.imaging.mosaic import check_pointings, with_beams
 from casa_sara.imaging.spectra import divided_by_band, with_subbands
 from casa_sara.imaging.time_forecast import measure
 from casa_sara.operators.measurement import check_field
+from casa_sara.parallel.partition import ALONE
 from casa_sara.parallel.serial import SERIAL
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.runtime.machine import available_memory, resident_memory
@@ -43,7 +44,7 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL):
     casa_sara.parallel.partition.RankAssignment
     """
     resident, available = resident_memory(), (available_memory() - WRITER) // comm.node_size
-    channels, share = _channels(selection, grid)
+    channels, share = comm.once(_channels, selection, grid)
     for flags in (False, True):
         volume = comm.once(measure_volume, selection, flags, grid.stokes)
         if any(volume.reach):  # else there is nothing to read, which reading explains
@@ -54,7 +55,8 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL):
             work = Workload.of(volume, grid, options, limits.report, band, ranks)
             return forecast(replace(work, channels=channels, share=share), resident, available, limits.maxmem_gb)
 
-        ranks = assign_ranks(comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
+        ranks = ALONE if grid.is_cube else assign_ranks(  # each rank has its channels, and reads all
+            comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
         found = memory_of(ranks)
         if all(comm.allgather(found.fits)):
             break

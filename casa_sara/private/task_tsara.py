@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -69,11 +68,11 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
                          "in the first lines of the log of a normal run, and docs/parallel.md explains its time")
     if parameters["dryrun"]:
         return {"forecast": dry_run(selection, grid, options, _blocks(parameters), limits)}
-    make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
+    make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
         result = make(ImagingRequest(selection, grid, weighting, options, output, limits),
-                      lambda result: tell(result, options, full=True)["sara"])
+                      lambda result: tell(result, options, full=True)["sara"], comm)
         if parameters["report"]:
             comm.once(_report, output.imagename, selection, options.nthreads, grid.is_cube)
         elif not output.images_stand:
@@ -165,9 +164,6 @@ def _refuse_for_cubes(parameters):
     """Raise on parameters that are for continuum images only."""
     if parameters["specmode"] != "cube":
         return
-    if parameters["parallel"]:
-        raise ValueError("parallel = True with specmode = 'cube': only continuum images can be shared by several "
-                         "processes; should be False. Channels can be divided among several runs with start and nchan")
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")

@@ -600,8 +600,8 @@ class _tsara:
         script.py", where every rank calls the task, or with "mpicasa -n 5 casa -c script.py", where
         casampi's client has its servers do it. It takes mpi4py (pip install casa_sara[mpi]) and Open
         MPI or MPICH. nthreads, and maxmem, are those of each rank; nthreads=0 shares the cores of a
-        machine among its ranks. See docs/parallel.md. False runs in one process, with nthreads
-        threads.
+        machine among its ranks. Of a cube, each rank solves some of the channels, and needs the memory
+        of one process. See docs/parallel.md. False runs in one process, with nthreads threads.
 
     Returns
     -------
