@@ -231,7 +231,7 @@ def _distinct(lattice, offsets):
 
 
 def _found(key, number, least, volume):
-    """Return the distinct keys, sorted, which lie from `least` to `least` + `volume`; `number` receives their places."""
+    """Return the distinct keys, sorted, which lie between `least` and `least` + `volume`; `number` receives places."""
     if volume > SPARSE * key.size:
         found, number[...] = np.unique(key, return_inverse=True)
         return found

@@ -60,8 +60,12 @@ def thermal_noise(data, weights, noise, offsets, comm=SERIAL):
     -------
     float
     """
-    level = np.repeat(np.where(np.isfinite(noise), noise, 1.0), np.diff(offsets))
-    power = comm.total(float(np.sum((weights * level) ** 2 / data.weight, dtype=float)))
+    power = 0.0
+    for piece in data.scratch.pieces(0, data.size):
+        counts = np.diff(np.clip(offsets, piece.start, piece.stop))
+        level = np.repeat(np.where(np.isfinite(noise), noise, 1.0), counts)
+        power += float(np.sum((weights[piece] * level) ** 2 / data.weight[piece], dtype=float))
+    power = comm.total(power)
     return float(np.sqrt(power) / comm.total(float(weights.sum(dtype=float))))
 
 

@@ -50,7 +50,7 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     data : Visibilities
         The samples.
     model : real (nx, ny)
-        Jy/pixel.
+        Jy/pixel; (T, nx, ny) at the frequencies of `grid.subbands`, where there are some and the model differs there.
     grid : ImageGrid
         Size, pixels, direction and gridder of the image.
     weighting : Weighting
@@ -69,7 +69,8 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     weights, operator, psf, beam = point_spread(data, grid, weighting, options, plane, comm)
     if grid.is_mosaic:
         operator = _operator(data, grid, options, comm)
-    residual = dirty_image(operator, _residual(operator, data, grid, options, model, comm), weights, comm)
+    seen = model if grid.subbands is None else grid.subbands.stacked(model)
+    residual = dirty_image(operator, _residual(operator, data, grid, options, seen, comm), weights, comm)
     pixels = dict(psf=psf, residual=residual, model=model)
     if grid.is_mosaic:
         pixels["weight"] = weight_image(data, grid, weights)
@@ -84,11 +85,11 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
 def _residual(operator, data, grid, options, model, comm):
     """Return the visibilities less those of a model; of samples on the disk what gives them piece by piece.
 
-    These are predicted by the operator of the dirty images unless there is a spectrum.
+    These are predicted by the operator of the dirty images unless there are spectra.
     """
     if data.scratch.on_disk and grid.spectrum is None:
         return lambda piece, operator: data.vis[piece] - operator.forward(model)
-    if grid.spectrum is not None:
+    if grid.spectrum is not None or grid.subbands is not None:
         operator = _sky_operator(data, grid, options, comm, data.freq_hz)
     if data.scratch.on_disk:
         predicted = operator.forward_pieces(model)

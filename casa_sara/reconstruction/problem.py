@@ -33,6 +33,7 @@ MOST_DOUBLINGS = 2  # of the cells, where there are more averages than pixels
 MOST_HALVINGS = 8  # what is still wrong in cells 256 times smaller is not due to them
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
 ON_DISK_EPS = 1e-6  # of the operator of samples on the disk, which makes images, too
+STEEPEST = 2.0  # spectral index for which averages over frequency are made, where it is not known
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
@@ -108,7 +109,7 @@ class Problem:
 
     `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
     `samples` where that is None. `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image
-    times `sky_over_image`.
+    times `sky_over_image`; with `subbands` the images of several frequencies are stacked.
     """
 
     samples: Samples
@@ -121,6 +122,7 @@ class Problem:
     support: np.ndarray | None = None
     averaged: Averaged | None = None
     sky_over_image: np.ndarray | None = None
+    subbands: Any = None
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - four have a default
@@ -159,7 +161,7 @@ class Problem:
         operator = partial(sky_operator, grid=grid, eps=eps, nthreads=options.nthreads, comm=comm)
         vis: Any = None if data.scratch.on_disk else data.vis * np.sqrt(data.weight)
         measurement = _whitened_operator(data, operator, grid, options, unit_jy)
-        precond = _preconditioner(samples, options.precondition, comm)
+        precond = _preconditioner(samples, options.precondition, comm, grid.subbands)
         averaged = None
         if options.averages and grid.mosaic is None:
             averaged, uvw, freq_hz = _averages(partial(Averaged.of, data, offsets, averaging_cell(grid), vis=vis,
@@ -172,9 +174,11 @@ class Problem:
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
             data_norm_sq = float(comm.bcast(power_method(
-                lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32)))
+                lambda image: whole.adjoint(precond * whole.forward(image)), measurement.shape, dtype=np.float32)))
+        if support is not None and grid.subbands is not None:
+            support = np.tile(support, (grid.subbands.count, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
-                   grid.mosaic and grid.mosaic.over)
+                   grid.mosaic and grid.mosaic.over, grid.subbands)
 
     def flux_jy(self, image: np.ndarray) -> float:
         """Return Σ|I| of the sky of an image, which no visibility of it exceeds.
@@ -188,6 +192,9 @@ class Problem:
         -------
         float
         """
+        if self.subbands is not None:
+            fluxes = np.abs(self.subbands.split(image)).sum(axis=(1, 2), dtype=float)
+            return self.unit_jy * float((np.abs(self.subbands.factors(self.subbands.band_hz)).T @ fluxes).max())
         sky = image if self.sky_over_image is None else image * self.sky_over_image
         return self.unit_jy * float(np.abs(sky).sum(dtype=float))
 
@@ -198,16 +205,17 @@ def _averages(average, samples, finer, grid, options):
     Unless `finer` says how large the cells are they are enlarged while there are more averages than pixels: to a phase
     of up to 0.4 rad, which those of samples on the disk have at once.
     """
-    known, on_disk, blocks = finer is not None, samples.data.scratch.on_disk, len(samples.offsets) - 1
+    enlarging = finer is None and not options.jackknife and grid.subbands is None
+    on_disk, blocks = samples.data.scratch.on_disk, len(samples.offsets) - 1
     if finer is None:
-        finer = np.full(blocks, -MOST_DOUBLINGS if on_disk and not options.jackknife else 0)
+        finer = np.full(blocks, -MOST_DOUBLINGS if on_disk and enlarging else 0)
     while True:
         found, averages, most = (None, None, None), math.inf, math.inf
         with suppress(OverflowError):  # hardly two samples share one of so many cells
             found = average(finer)
             comm = found[0].comm
             averages, most = comm.total(found[0].cells.size), WORTHWHILE * comm.total(samples.data.size)
-        if known or averages <= math.prod(grid.shape) or options.jackknife or finer.min() == -MOST_DOUBLINGS:
+        if not enlarging or averages <= math.prod(grid.shape) or finer.min() == -MOST_DOUBLINGS:
             break
         finer = finer - 1
     if averages <= most < math.inf:
@@ -244,6 +252,8 @@ def averaging_cell(grid: ImageGrid) -> np.ndarray:
         Along v, u, w and ln ν.
     """
     index = 0.0 if grid.spectrum is None else float(np.abs(grid.spectrum.index).max())
+    if grid.subbands is not None:
+        index = STEEPEST
     depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
     return cell_sides(grid.shape, grid.cell_rad, depth, index)
 
@@ -324,11 +334,14 @@ def _told_of_all(found, samples, layout, comm):
     return [told for _, told in sorted(sum(comm.allgather(list(numbered)), []), key=lambda one: one[0])]
 
 
-def _preconditioner(samples, wanted, comm):
+def _preconditioner(samples, wanted, comm, subbands=None):
     """U = 1/density, largest value 1.
 
     Samples of very low weight that are alone in their uv cells (bad data that were down-weighted instead of flagged)
     are not raised to the weight of other cells: the density is taken to be at least 1e-2·Σw²/Σw.
+
+    Of several frequencies it is that times Σ_t g_t², g_t what each image contributes to the sample: where in the uv
+    plane there are but samples of the edges of the band, these would weigh up to T² times as much as the others.
     """
     data, scratch = samples.data, samples.data.scratch
     if not wanted:
@@ -338,8 +351,13 @@ def _preconditioner(samples, wanted, comm):
         squares += float(np.square(data.weight[piece], dtype=float).sum())
         weights += float(data.weight[piece].sum(dtype=float))
     least = LIGHT * (comm.total(squares) / comm.total(weights))
-    greatest = comm.largest(1.0 / max(float(samples.density.min(initial=np.inf)), least))
+
+    def inverse(piece):
+        precond = 1.0 / np.maximum(np.asarray(samples.density[piece], float), least)
+        return precond if subbands is None else precond / np.square(subbands.factors(data.freq_hz[piece])).sum(axis=0)
+
+    greatest = comm.largest(max(inverse(piece).max(initial=0) for piece in scratch.pieces(0, data.size)))
     precond = scratch.empty(data.size, np.float32)
     for piece in scratch.pieces(0, data.size):
-        precond[piece] = 1.0 / np.maximum(np.asarray(samples.density[piece], float), least) / greatest
+        precond[piece] = inverse(piece) / greatest
     return precond

@@ -192,8 +192,9 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     if data.scratch.on_disk:
         digests |= {name: digest_on_disk(array, data.scratch) for name, array in gathered.items()}
     spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
+    subbands = grid.subbands and grid.subbands.freqs_hz
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
-        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex,
+        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex, subbands=subbands,
         sensitivity=grid.mosaic and grid.mosaic.over).items()}
     comm.once(checkpoint.identify, **digests)
 
@@ -239,11 +240,12 @@ def _result(solution, record, samples, averaging, comm, goes_on):
     if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
+    subbands = solution.subbands
     return Reconstruction(
-        model, bounds.l2_bounds, ppd.residual_norms.copy(), found.nnls_norms, record,
+        ppd.planes.at_reference(model), bounds.l2_bounds, ppd.residual_norms.copy(), found.nnls_norms, record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
-        wild=found.wild, averaging=averaging,
+        wild=found.wild, averaging=averaging, spectra=None if subbands is None else subbands.spectra(model),
         **{name: resampling.draws for name, resampling in resamplings.items()})
 
 

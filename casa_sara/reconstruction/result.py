@@ -42,6 +42,8 @@ class Reconstruction:
         they were not.
     draws, jackknife : Draws or None
         Of the bootstrap and of the jackknife, where asked for and the solution has come to an end.
+    spectra : float32 (T, nx, ny) or None
+        The model at several frequencies, Jy/pixel, where it was solved for at these; `model` is that at the reference.
     """
 
     model: np.ndarray
@@ -57,6 +59,7 @@ class Reconstruction:
     averaging: dict
     draws: Draws | None = None
     jackknife: Draws | None = None
+    spectra: np.ndarray | None = None
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Reconstruction:
