@@ -1,4 +1,4 @@
-"""A simulated observation of 10⁷ or 10⁸ visibilities, written in bulk.
+"""A simulated observation of 10⁴ to 10⁸ visibilities, written in bulk.
 
     python benchmarks/large_ms.py FOLDER [--visibilities 1e8]
 
@@ -33,7 +33,7 @@ ROWS = 20_000  # written at a time
 
 def observation_of(visibilities):
     """Return the `Observation` of that many."""
-    channels = 16 if visibilities < 3e7 else 64
+    channels = next(count for most, count in ((3e4, 1), (3e5, 4), (3e7, 16), (np.inf, 64)) if visibilities < most)
     integrations = round(visibilities / (SCANS * BASELINES * channels))
     return replace(VLA, channels=channels, channel_hz=BAND_HZ / channels, integrations=integrations,
                    integration_s=SCAN_S / integrations)

@@ -12,6 +12,7 @@ from simulated_ms import pixels, simulate
 from test_averaging import GRID, OPTIONS, SOURCES, fourier, observed, sky_of, tracks
 
 from casa_sara import tsara
+from casa_sara.casa.ms.data_volume import DataVolume
 from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.ms.weights import dirty_image, imaging_weights, sampling_density
 from casa_sara.data.averaging import Averaged
@@ -20,9 +21,11 @@ from casa_sara.data.noise import noise_from_differences
 from casa_sara.data.outliers import find_wild
 from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.imaging import dry_run
+from casa_sara.imaging.memory_forecast import Workload, forecast
 from casa_sara.operators.piecewise import operator_on_disk
 from casa_sara.operators.sky import sky_operator
-from casa_sara.options import ImageGrid, Selection, Weighting
+from casa_sara.options import ImageGrid, Limits, Selection, SolverOptions, Weighting
+from casa_sara.parallel.serial import SERIAL
 from casa_sara.reconstruction import problem
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.problem import averaging_cell
@@ -252,3 +255,34 @@ def test_the_task_makes_the_same_images(vis, tmp_path, monkeypatch, options):
         images = [pixels(str(tmp_path / f"{one}.{name}")) for one in ("here", "there")]
         np.testing.assert_allclose(*images, atol=tolerance * max(np.abs(images[0]).max(), 1.0))
     assert {name.split(".")[0] for name in os.listdir(tmp_path)} == {"here", "there"}
+
+
+def test_forecast_of_many_visibilities():
+    """10⁸ of 12 blocks, as docs/validation.md has them, fit into 4 GB on the disk only."""
+    grid = ImageGrid((1024, 1024), (2.9e-7, 2.9e-7))
+    volume = DataVolume(100_000_000, (1.05e6, 1.05e6))
+    work = Workload.of(volume, grid, SolverOptions())
+    needed = [forecast(one, 400_000_000, 10**11).needed for one in (work, replace(work, on_disk=True, blocks=12))]
+    assert needed[0] > 12e9 and 1.5e9 < needed[1] < 3.6e9
+    assert forecast(replace(work, on_disk=True, blocks=1), 0, 0).needed > 7e9  # a block is worked on at a time
+
+
+@pytest.mark.parametrize(("changed", "on_disk"), [
+    ({}, True), (dict(specmode="cube"), False), (dict(gridder="mosaic"), False), (dict(nterms=3), False)])
+def test_what_cannot_be_on_the_disk_is_in_memory(changed, on_disk):
+    grid = replace(ImageGrid((64, 64), (1e-6, 1e-6)), **changed)
+    assert dry_run._may_be_on_disk(grid, SolverOptions(), Limits(), SERIAL) is on_disk
+    for options in (SolverOptions(method="dabbech2018"), SolverOptions(databound="weights")):
+        assert not dry_run._may_be_on_disk(grid, options, Limits(), SERIAL)
+    assert not dry_run._may_be_on_disk(grid, SolverOptions(), Limits(report=True), SERIAL)
+
+
+def test_what_does_not_fit_into_memory_goes_to_the_disk(vis, monkeypatch):
+    selection, grid = Selection(vis=(vis,), datacolumn="data"), ImageGrid((64, 64), (2.5e-6, 2.5e-6))
+    monkeypatch.setattr(dry_run, "LEAST", 1)
+    found, _ = dry_run.forecast_run(selection, grid, SolverOptions(), Limits())
+    assert not found.workload.on_disk
+    found, _ = dry_run.forecast_run(selection, grid, SolverOptions(), Limits(maxmem_gb=0.01), blocks=3)
+    assert found.workload.on_disk and found.workload.blocks == 3 and not found.fits
+    with pytest.raises(OSError, match="GB of disk|GB left"):
+        dry_run.scratch_of("there", replace(found.workload, samples=10**14))

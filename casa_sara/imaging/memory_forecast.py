@@ -30,7 +30,8 @@ AVERAGED = 16  # of all: whitened, the numbers of their cells, the density
 AVERAGE = 72  # of an average: that of SOLVER, POINT and the sums of its cell
 RENEWING = 24  # of all: residual and its sums
 # samples on the disk: of each, of each of the largest block, and of each of a piece that is worked on
-HELD, OF_BLOCK, OF_PIECE = 18, 70, 160
+HELD, OF_BLOCK, OF_PIECE = 12, 70, 160
+FILLED = 0.5  # of the uv cells within reach, at most
 WEIGHING = 30  # uv cells and densities
 SORTING = 12  # of a cube: channels of the samples, and their order
 CHECKPOINT = 16  # the dual and Φz
@@ -131,14 +132,12 @@ class Workload:
         phases = few._of_plane()
         for name in ("reading", "building the operator"):
             phases.pop(name, None)
-        for parts in phases.values():
-            parts["averages"] = parts.pop("visibilities")
         return {phase: parts | held for phase, parts in phases.items()}
 
     def most_averages(self):
-        """Return how many averages there are at most: one in each enlarged cell, but no more than is worthwhile."""
+        """Return how many averages there are at most: in half of the enlarged cells, but no more than is worthwhile."""
         v, u, *_ = 2.0**MOST_DOUBLINGS * cell_sides(self.shape, self.cell_rad)
-        cells = math.pi * (self.reach[0] / u + 1) * (self.reach[1] / v + 1) / 2  # of half an ellipse
+        cells = FILLED * math.pi * (self.reach[0] / u + 1) * (self.reach[1] / v + 1) / 2  # of half an ellipse
         blocks = self.blocks or math.ceil(self.samples / SNAPSHOT_SAMPLES)
         return min(math.ceil(WORTHWHILE * self.samples), math.ceil(cells * blocks))
 
