@@ -175,6 +175,9 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
     if released:
         log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie "
                  "between pixel centres")
+    if reconstruction.total_power:
+        log.info("total power: noise found {noise_jy_per_beam:#.3g} Jy/beam, rms of the residual "
+                 "{residual_jy_per_beam:#.3g} Jy/beam at {points} points".format(**reconstruction.total_power))
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")

@@ -168,7 +168,7 @@ class SkyImage:
                                                         plane=plane)
 
 
-def read_sky_image(name, parameter, units):
+def read_sky_image(name, parameter, units, holes=False):
     """Read one image plane.
 
     Parameters
@@ -179,6 +179,8 @@ def read_sky_image(name, parameter, units):
         Task parameter that named it, for messages.
     units : sequence of str or None
         What is right here: out of 'Jy/pixel', 'Jy/beam', ''; units that can be converted to these are. None takes any.
+    holes : bool
+        Pixels may be masked, or not finite, and are NaN then; else the mask is not looked at.
 
     Returns
     -------
@@ -198,6 +200,8 @@ def read_sky_image(name, parameter, units):
             check_sky_axes(name, parameter, csys)
             _check_plane(name, parameter, shape, csys)
             pixels = read_pixels(ia)
+            if holes:
+                pixels[~read_pixels(ia, getmask=True) | ~np.isfinite(pixels)] = np.nan
     except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
     unit, factor = unit_of(given, csys)
@@ -206,7 +210,7 @@ def read_sky_image(name, parameter, units):
         hint = "; the model is the image before it is convolved with the beam" if unit == "Jy/beam" else ""
         raise ValueError(f"{parameter} = '{name}' is in '{given}': should be in {right}{hint}")
     pixels *= np.float32(factor)
-    bad = int(np.sum(~np.isfinite(pixels)))
+    bad = 0 if holes else int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
     return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]),
