@@ -22,7 +22,7 @@ from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, Weighting
 from casa_sara.reconstruction.compile_cache import kernels_loading
 
-__all__ = ["Observed"]
+__all__ = ["Observed", "common_gridder"]
 
 SMALLEST_W_PHASE = 0.01  # rad, in the corners of the image, that is worth the w-term
 
@@ -44,7 +44,7 @@ class Observed:
         with kernels_loading(log.info):
             data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
         notes.extend(data.notes + check_pointings(data, replace(grid, onepointing=True)))
-        self._gridder = _common_gridder(sets, data.max_w, plane, notes)
+        self._gridder = common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)
         notes.extend(image_plane.notes)
         self.plane, self._data, self._nthreads = SkyPlane(image_plane.csys, plane.shape), data, request.nthreads
@@ -102,7 +102,7 @@ class Observed:
         return self._operators[key]
 
 
-def _common_gridder(sets, max_w, plane, notes):
+def common_gridder(sets, max_w, plane, notes):
     """Return the measurement operator for the residuals of all products, with a note about the reason.
 
     That is without the w-term where all were imaged without it, or where it is nothing; else with it.

@@ -58,7 +58,7 @@ from casa_sara.reconstruction.total_power import TotalPower
 from casa_sara.runtime.deadline import Deadline
 
 __all__ = [
-    "Result", "Split", "describe", "make_image", "split",
+    "Result", "Split", "after_iterations", "describe", "make_image", "split",
 ]
 
 MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
@@ -235,8 +235,8 @@ def _solve(request, plane, part, watch, ranks):
     options, grid, comm, data = request.options, plane.grid, ranks.comm, part.data
     if options.niter == 0:
         return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
-    watch.deadline.reserve = _after_iterations(comm.total(data.size), grid, request.output, request.limits,
-                                               watch.deadline.elapsed()) + error_seconds(options, grid.shape)
+    watch.deadline.reserve = after_iterations(comm.total(data.size), grid.shape, request.output, request.limits,
+                                              watch.deadline.elapsed()) + error_seconds(options, grid.shape)
     samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise,
                       total_power=plane.dish)
     found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, ranks)
@@ -307,10 +307,10 @@ def _peak(name):
         return float(np.abs(read_pixels(ia)).max())
 
 
-def _after_iterations(samples, grid, output, limits, read_s):
+def after_iterations(samples, shape, output, limits, read_s):
     """Seconds to reserve for the time after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
-    return writing_seconds(samples, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
+    return writing_seconds(samples, shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
 
 def describe(data, blocks, noise, stokes, comm=SERIAL):

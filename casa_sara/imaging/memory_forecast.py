@@ -36,6 +36,7 @@ MATCHED = 13  # of the matched filters, while the support is found
 DRAW, DRAWN_PART = 1.5, 0.3  # of a draw of the bootstrap, and the part of the image where a confined model may be
 ERRORS = 10  # images of errors, and of the smoothing
 CUBES = 3  # psf, residual and model of each channel
+MASK = 1.25  # of each channel of a cube, as it is used and as it is written
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
 REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one visibility, image planes
@@ -98,13 +99,14 @@ class Workload:
         one.pop("reading")
         writing = one.pop("writing")
         held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
-                "cubes": self._planes((PLANE + CUBES) * self.channels)}
+                "cubes": self._planes((PLANE + CUBES + MASK * self.masked) * self.channels)}
         reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples,
                    "while reading": READING * self.samples}
         return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
                 "images of a channel": writing | held,
                 "writing": {"libraries": LIBRARIES, **held,
-                            "process that writes": self._planes((PLANE + CUBES + 1) * self.channels)}}
+                            "process that writes": self._planes((PLANE + CUBES + MASK * self.masked + 1)
+                                                                * self.channels)}}
 
     def _of_plane(self):
         """The phases of one plane, in their order."""

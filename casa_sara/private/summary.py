@@ -77,7 +77,7 @@ def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False)
     minor, ends, done = {}, [], 0
     for number, channel in enumerate(result.channels):
         if channel.result:
-            minor[number] = {0: _minor(channel.result, _stop_code(channel, result))}
+            minor[number] = {0: _minor(channel.result, result.code_of(channel))}
             ends += [done + end for end in minor[number][0]["iterDone"]]
             done = ends[-1] if ends else 0
     sara = {
@@ -89,7 +89,7 @@ def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False)
         "nthreads": options.nthreads,
         "forecast": dict(result.forecast),
         "outframe": result.frame,
-        "channels": [_channel(channel, _stop_code(channel, result), options, full) for channel in result.channels],
+        "channels": [_channel(channel, result.code_of(channel), options, full) for channel in result.channels],
     }
     return _outcome(options, ends, result.stop_code, minor, sara)
 
@@ -106,12 +106,6 @@ def _outcome(options, ends, code, minor, sara):
         "summaryminor": {0: minor},
         "sara": sara,
     }
-
-
-def _stop_code(channel, cube):
-    """Return the stop code of a channel: for one that was not solved, the code of the run."""
-    solved = channel.result and channel.result.reconstruction
-    return solved.record.stop_code if solved else cube.stopped or ITERATION_LIMIT
 
 
 def _channel(channel, code, options, full):

@@ -85,7 +85,7 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
         result = make(ImagingRequest(selection, grid, weighting, options, output, limits, dish),
                       lambda result: tell(result, options, full=True)["sara"])
         if parameters["report"]:
-            comm.once(_report, output.imagename, selection, options.nthreads)
+            comm.once(_report, output.imagename, selection, options.nthreads, grid.is_cube)
         elif not output.images_stand:
             comm.once(folder.remove, Path(output.imagename + REPORT))  # of older images
     return comm.bcast(tell(result, options, parameters["fullsummary"]))
@@ -113,14 +113,17 @@ def _warn_of_incomplete(vis, output):
                  "with it before tsara with restart=True, niter=0, savemodel='modelcolumn' has written it again")
 
 
-def _report(imagename, selection, nthreads):
+def _report(imagename, selection, nthreads, cube):
     """Write the report of one run."""
+    from casa_sara.analysis.cube_report import write_cube_report
     from casa_sara.analysis.report import write_report
+    from casa_sara.comparison.compare_cubes import compare_cubes
     from casa_sara.comparison.compare_images import compare_images
 
     log.info("writing the report")
-    comparison = compare_images(Comparing((imagename,), nthreads=nthreads), selection, single=True)
-    write_report(comparison, Path(imagename + REPORT), f"tsara: {Path(imagename).name}")
+    compare, write = (compare_cubes, write_cube_report) if cube else (compare_images, write_report)
+    comparison = compare(Comparing((imagename,), nthreads=nthreads), selection, single=True)
+    write(comparison, Path(imagename + REPORT), f"tsara: {Path(imagename).name}")
 
 
 def selection_of(parameters: dict[str, Any]) -> Selection:
@@ -171,24 +174,12 @@ def _refuse_for_cubes(parameters):
     """Raise on parameters that are for continuum images only."""
     if parameters["specmode"] != "cube":
         return
-    if parameters["savemodel"] != "none":
-        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': MODEL_DATA is written "
-                         "from continuum images only; should be 'none'")
     if parameters["parallel"]:
         raise ValueError("parallel = True with specmode = 'cube': only continuum images can be shared by several "
                          "processes; should be False. Channels can be divided among several runs with start and nchan")
-    if parameters["stokes"] != "I":
-        raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes can only be made in "
-                         "Stokes I; should be 'I'")
-    if parameters["usemask"] == "pb" or parameters["mask"]:
-        raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': "
-                         "masks can only be used for continuum images; should be usemask = 'user', mask = ''")
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
-    if parameters["report"]:
-        raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be "
-                         "False")
 
 
 def _check_errors(parameters):

@@ -349,8 +349,9 @@ class _tsara:
 
     restoringbeam : str or list of str, default []
         Opened by restoration = True.
-        [] fits a Gaussian to the main lobe of the psf. With another beam, the residual is convolved
-        to the same resolution.
+        [] fits a Gaussian to the main lobe of the psf, of each channel in a cube; 'common' is the
+        smallest beam that holds those of all channels. With another beam, the residual is convolved to
+        the same resolution.
         Examples: restoringbeam='0.3arcsec'
                   restoringbeam=['8arcsec', '10arcsec', '45deg']
 
@@ -402,7 +403,9 @@ class _tsara:
         Opened by usemask = 'user'.
         A region in CASA's text format (CRTF), a file of them, or an image of ones and zeros on any
         grid, CASA's or a FITS file; or a list of these, whose union counts. '' is no mask. An entry
-        that selects nothing of the image is refused.
+        that selects nothing of the image is refused. In a cube, a region (without a range of its own)
+        and an image of one channel hold in every channel; an image of as many channels as the cube has
+        a mask for each.
         Examples: mask='circle[[40pix,40pix],10pix]'
                   mask='old.mask'
                   mask=['regions.crtf', 'circle[[19h59m28.5s, 40d44m02s], 100arcsec]']
@@ -572,7 +575,9 @@ class _tsara:
     report : bool, default False
         True writes a page with the images, residuals with natural and Briggs weights, convergence, the
         noise found in every snapshot, and all numbers: imagename.report/report.html, and its pictures
-        beside it. The task saracompare writes the same for several images.
+        beside it. Of a cube it shows the spectrum, the maps of the line, all channels with their
+        residuals, and noise and islands of each. The task saracompare writes the same for several
+        images.
 
     restart : bool, default False
         True continues a run that was killed, was stopped with Ctrl-C, or whose machine went down. It
@@ -594,7 +599,8 @@ class _tsara:
         self-calibration, after the images have been written. 'none' leaves the MeasurementSets
         untouched. Together with restart=True and niter=0 it writes the visibilities of the existing
         imagename.model and keeps the images, for example after a run was killed while it wrote the
-        column.
+        column. Of a cube, each sample has the model of the channel that it belongs to, and 0 where it
+        belongs to none.
 
     parallel : bool, default False
         True shares data, wavelets and memory among the processes (ranks) of an MPI job, on one
@@ -611,7 +617,8 @@ class _tsara:
       As tclean's: iterdone, niter, nmajordone, stopcode, stopDescription, summarymajor,
       summaryminor. Stop codes: 101 converged, 102 iteration limit, 103 noise only, 104 stopped by
       user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit,
-      108 converged but the residual is not noise (more than 5 sigma over a beam or more).
+      108 converged but the residual is not noise (more than 5 sigma over a beam or more), 109 the
+      mask of this channel is empty.
       The key 'sara' holds its own record: the islands of emission ('islands': place, flux with its
       error, S/N, size; with ndraws bootstrap_error_jy, the error that the draws give; with
       jackknife jackknife_error_jy), the largest S/N of the residual by width ('residual_snr'), the
