@@ -9,8 +9,9 @@ second of which leaves a gap to the baselines.  The visibilities are computed fr
 
 Flux is that of the sky within 60 arcsec, the FWHM that of a Gaussian of the same second moments there; SNR = 20
 log10(‖truth‖/‖truth − image‖), both smoothed to the beam of tclean and to 10 arcsec.  tclean is multiscale, the best at
-10 arcsec of SETTINGS; its restored image is divided by the primary beam before it is feathered.  sdintimaging runs with
-the same settings; its model is looked at.
+10 arcsec of SETTINGS, all with a mask of 60 arcsec around the source, without which tclean and sdintimaging diverge;
+its restored image is divided by the primary beam before it is feathered.  sdintimaging runs with the same settings; its
+model is looked at.  tsara has no mask.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ CENTRE = (299.86875, 40 + 44 / 60 + 2 / 3600)
 VLA_BEAM = 324.0  # arcsec, of CASA's primary beam near its top
 DISHES = (45.0, 88.0)
 NOISE = (0.002, 0.02)  # Jy/beam
-SETTINGS = {"scales to 21 arcsec": ((0, 5, 15, 30), 20_000), "scales to 56 arcsec": ((0, 5, 15, 40, 80), 20_000)}
+SCALES = (0, 15, 40)  # pixels; 10 and 28 arcsec
+SETTINGS = {f"{niter} iterations, gain {gain}": (niter, gain) for niter, gain in ((300, 0.1), (1000, 0.1))}
 
 
 def the_sky():
@@ -105,6 +107,38 @@ def gaussian(folder):
     print("| image | flux, Jy | FWHM, arcsec | SNR at one beam, dB | at 10 arcsec |\n|---|---|---|---|---|")
     for label, flux, width, one, ten in rows:
         print(f"| {label} | {flux:.3f} | {width:.1f} | {one:.1f} | {ten:.1f} |", flush=True)
+    picture(folder, truth, beam, cleans[-1][2])
+
+
+def picture(folder, truth, beam, clean):
+    """Draw the sky, and what was made of it with the first dish and its lower noise, all at tclean's beam."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    from casa_sara.analysis.metrics import smooth
+    from casa_sara.demo.imagers import read_image
+
+    name = f"dish{DISHES[0]:g}_{NOISE[0]:g}"
+    sdint = f"sdint_{name}_{list(SETTINGS.values())[-1][0]}_{list(SETTINGS.values())[-1][1]}"
+    models = {"truth": truth} | {label: over_beam(read_image(folder / f"{root}.model")[0],
+                                                  read_image(folder / f"{pb}.pb")[0])
+                                 for label, root, pb in (("tsara, visibilities alone", "tsara_", "tsara_"),
+                                                         ("tsara with the dish", f"tsara_{name}", f"tsara_{name}"),
+                                                         ("sdintimaging", f"{sdint}.joint.cube", f"{sdint}.int.cube"))}
+    images = {label: smooth(model, beam / CELL) for label, model in models.items()}
+    images["feather"] = feathered(folder, clean, str(folder / f"{name}.im"), beam)
+    figure, axes = pyplot.subplots(1, len(images), figsize=(3 * len(images), 3.4), layout="constrained")
+    half, peak = SIZE // 8, images["truth"].max()
+    box = (slice(SIZE // 2 - half, SIZE // 2 + half),) * 2
+    for axis, (label, image) in zip(axes, images.items()):
+        shown = axis.imshow(image[box].T / peak, origin="lower", vmin=-0.1, vmax=1.1, cmap="inferno",
+                            extent=np.array([-1, 1, -1, 1]) * half * CELL)
+        axis.set_title(label, fontsize=10)
+    axes[0].set_ylabel("arcsec")
+    figure.colorbar(shown, ax=axes, label="of the true peak", shrink=0.8)
+    figure.savefig(folder / "total_power.png", dpi=80)
 
 
 def best(found):
@@ -132,15 +166,20 @@ def cleaned(folder, name, setting):
 
     from casa_sara.demo.imagers import quiet, read_image
 
-    root, (scales, niter) = folder / f"clean_{max(SETTINGS[setting][0])}", SETTINGS[setting]
+    (niter, gain), root = SETTINGS[setting], folder / "clean_{}_{}".format(*SETTINGS[setting])
     if not Path(f"{root}.image").exists():
         with quiet(folder / "tclean.txt"):
             tclean(vis=name, imagename=str(root), imsize=SIZE, cell=f"{CELL}arcsec", datacolumn="data",
-                   uvrange=UVRANGE, deconvolver="multiscale", scales=list(scales), niter=niter, gain=0.2, nsigma=2.0,
-                   weighting="natural")
+                   uvrange=UVRANGE, weighting="natural", **_multiscale(niter, gain))
     axes = read_image(f"{root}.image")[1]
     model, pb = read_image(f"{root}.model")[0], read_image(f"{root}.pb")[0]
     return over_beam(model, pb), float(np.sqrt(axes[0] * axes[1])), root
+
+
+def _multiscale(niter, gain):
+    """The parameters of the deconvolution."""
+    return dict(deconvolver="multiscale", scales=list(SCALES), niter=niter, gain=gain, cycleniter=100, usemask="user",
+                mask=f"circle[[{SIZE // 2}pix,{SIZE // 2}pix],{round(RADIUS / CELL)}pix]")
 
 
 def feathered(folder, root, sd, beam):
@@ -176,16 +215,15 @@ def joined(folder, name, sd, dish):
 
     from casa_sara.demo.imagers import quiet, read_image
 
-    for scales, niter in SETTINGS.values():
-        root = folder / f"sdint_{Path(sd).stem}_{max(scales)}"
+    for niter, gain in SETTINGS.values():
+        root = folder / f"sdint_{Path(sd).stem}_{niter}_{gain}"
         try:
-            if not Path(f"{root}.joint.multiterm.image.tt0").exists() and not Path(f"{root}.joint.cube.model").exists():
+            if not Path(f"{root}.joint.cube.model").exists():
                 with quiet(folder / "sdint.txt"):
                     sdintimaging(usedata="sdint", sdimage=sd, sdpsf="", sdgain=1.0, dishdia=1.2 * 3e8 / FREQ / dish
                                  * 206265, vis=name, imagename=str(root), imsize=SIZE, cell=f"{CELL}arcsec",
                                  datacolumn="data", uvrange=UVRANGE, specmode="cube", nchan=1, gridder="standard",
-                                 deconvolver="multiscale", scales=list(scales), niter=niter, gain=0.2,
-                                 weighting="natural", nsigma=2.0, interpolation="nearest")
+                                 weighting="natural", interpolation="nearest", **_multiscale(niter, gain))
         except Exception as error:
             print(f"sdintimaging: {error}", flush=True)
             continue

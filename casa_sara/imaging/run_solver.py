@@ -33,6 +33,7 @@ from casa_sara.version import __version__
 
 __all__ = ["Watch", "checkpoint_of", "density_of", "expected_iterations", "solve_image", "without_wild"]
 
+AT_ODDS = 3.0  # times as much as a single dish alone leaves, from which on a residual is a warning
 MOST_NAMED = 20  # wild samples that the log names one by one
 
 
@@ -175,12 +176,23 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
     if released:
         log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie "
                  "between pixel centres")
-    if reconstruction.total_power:
-        log.info("total power: noise found {noise_jy_per_beam:#.3g} Jy/beam, rms of the residual "
-                 "{residual_jy_per_beam:#.3g} Jy/beam at {points} points".format(**reconstruction.total_power))
+    _log_total_power(reconstruction.total_power)
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")
+
+
+def _log_total_power(found):
+    """Write to the log what became of a single dish, {} where there is none; warn where it is at odds with the rest."""
+    if not found:
+        return
+    log.info("total power: noise found {noise_jy_per_beam:#.3g} Jy/beam, rms of the residual "
+             "{residual_jy_per_beam:#.3g} Jy/beam at {points} points".format(**found))
+    if found["residual_jy_per_beam"] > AT_ODDS * found["alone_jy_per_beam"]:
+        log.warn("sdimage and vis are at odds: the rms of what the model leaves of sdimage is "
+                 "{residual_jy_per_beam:.3g} Jy/beam, of what an image of sdimage alone leaves {alone_jy_per_beam:.3g} "
+                 "Jy/beam. Their flux scales may differ (sdgain), or their positions, or the beam of sdimage"
+                 .format(**found))
 
 
 class _Drawing:

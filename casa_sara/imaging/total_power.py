@@ -14,7 +14,7 @@ from casa_sara.reconstruction.total_power import TotalPower
 
 __all__ = ["total_power"]
 
-INSIDE = 0.95  # of the beam around a point, that must be in the part of the sky that is modelled
+INSIDE = 0.8  # of the beam around a point, that must be in the part of the sky that is modelled
 FEWEST = 4  # points
 SAME_FREQUENCY = 0.02
 GAP = 0.05  # of the flux that the dish passes at the shortest baseline
@@ -26,7 +26,7 @@ def total_power(asked, data, plane, grid):
 
     It measures the sky itself. The image is that of a mosaic times its sensitivity, or else the sky times the primary
     beam, by which it is divided; where that is below a tenth, or below pblimit, nothing is known of the sky, and points
-    are taken where 95 % of the dish's beam are elsewhere.
+    are taken where four fifths of the dish's beam are elsewhere.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def _check_beam(image, beam, data):
 
 
 def _inside(points, beam, grid, modelled):
-    """Whether the beam around each point is in the modelled part of the image, but for 5 % of it; bool (N,)."""
+    """Whether the beam around each point is in the modelled part of the image, but for a fifth of it; bool (N,)."""
     operator = SingleDishOperator(points, beam, grid.shape, grid.cell_rad)
     seen = operator.forward(modelled.astype(np.float32)).view(np.float32)[: points.size]
     return seen > INSIDE * beam.solid_angle / (grid.cell_rad[0] * grid.cell_rad[1])

@@ -249,9 +249,12 @@ def _result(solution, record, samples, averaging, comm, goes_on):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
     blocks = len(samples.offsets) - 1
-    total_power = {} if solution.dish is None else dict(
-        points=samples.total_power.values.size, noise_jy_per_beam=float(bounds.noise[-1] / solution.dish.scale),
-        residual_jy_per_beam=float(ppd.residual_norms[-1] / np.sqrt(2 * ppd.samples[-1]) / solution.dish.scale))
+    total_power = {}
+    if solution.dish is not None:
+        whitened = dict(noise=bounds.l2_bounds, residual=ppd.residual_norms, alone=found.nnls_norms)
+        total_power = dict(points=samples.total_power.values.size) | {
+            f"{name}_jy_per_beam": float(norms[-1] / np.sqrt(2 * ppd.samples[-1]) / solution.dish.scale)
+            for name, norms in whitened.items()}
     return Reconstruction(
         model, bounds.l2_bounds[:blocks], ppd.residual_norms[:blocks].copy(), found.nnls_norms[:blocks], record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,

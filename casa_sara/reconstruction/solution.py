@@ -19,7 +19,7 @@ from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_thre
 from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import bounds_of
-from casa_sara.reconstruction.total_power import MOST, PASSED, WhitenedDish
+from casa_sara.reconstruction.total_power import MOST, WhitenedDish
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperStage
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
@@ -83,8 +83,7 @@ class Solution:
         if dish is not None:
             most = np.append(np.full(weight_sums.size, np.inf), MOST)
             weight_sums = np.append(weight_sums, dish.weight_sum)
-            floor = found.nnls_norms[-1] * np.sqrt((1 - PASSED) / (2 * dish.vis.size))
-            noise = np.append(np.full(weight_sums.size - 1, np.nan) if noise is None else noise, floor)
+            noise = None if noise is None else np.append(noise, np.nan)
         return cls(found, ppd, bounds_of(ppd, found.nnls_norms, weight_sums, noise, options, most), dish=dish)
 
     def state(self, stage: Stage | PaperStage | None, layout: Layout, ranks: RankAssignment) -> dict[str, Any]:

@@ -162,9 +162,9 @@ class _tsara:
         scales that the baselines do not measure. It is data, as the visibilities are: a block of its own,
         whose noise is found as that of any block. It is in Jy/beam (or in K of the main beam, with beam and
         frequency in its header), of one plane, on any grid and in any frame, and may be masked. It is used
-        where it and the image overlap, at points half a beam apart, but for a margin of 0.7 of its beam
-        along the edges of what is modelled, where the dish sees what the image does not hold. Its frequency
-        must be within 2 per cent of that of the image.
+        where it and the image overlap, at points half a beam apart, but for a margin of 0.35 of its beam
+        along the edges of what is modelled: what the dish sees beyond the image is taken for empty, and
+        has to be less than a fifth of its beam. Its frequency must be within 2 per cent of that of the image.
         The dish sees the sky itself. With gridder='mosaic' that is the model; else the model is the sky times
         the primary beam, by which it is divided here, down to a tenth or to pblimit. .residual is of the
         visibilities alone; .model and .image hold both.
