@@ -34,6 +34,8 @@ EXCEPTIONS = {
     ("niter", "default"): "an upper limit: the data decide when to stop",
     ("niter", "range"): SURER,
     ("npixels", "range"): SURER,
+    ("nterms", "default"): "1 is the image of flat spectra; tclean has the default of one of its deconvolvers",
+    ("nterms", "openers"): "of all continuum images, as there is one way to solve for them",
     ("outframe", "allowed"): SURER,
     ("pblimit", "range"): SURER,
     ("perchanweightdensity", "allowed"): NARROWER,

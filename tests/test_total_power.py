@@ -292,6 +292,7 @@ def test_images_that_cannot_serve_are_refused(extended, tmp_path, change, messag
     (dict(databound="weights"), "databound = 'weights' with sdimage"),
     (dict(method="dabbech2018"), "method = 'dabbech2018' with sdimage"),
     (dict(stokes="V", positivity=False), "stokes = 'V' with sdimage"),
+    (dict(nterms=2), "nterms = 2 with sdimage"),
     (dict(spectralindex="-0.7"), "spectralindex = '-0.7' with sdimage"), (dict(sdgain=-1.0), "sdgain = -1.0: should"),
     (dict(sdimage="", sdgain=2.0), "sdgain = 2.0 has no effect with sdimage = ''"),
     (dict(sdimage="absent.im"), "sdimage = 'absent.im' does not exist")])

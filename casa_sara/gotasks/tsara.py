@@ -14,7 +14,7 @@ class _tsara(ShellTask):
         self, vis=None, selectdata=None, field=None, spw=None, timerange=None, uvrange=None, antenna=None, scan=None,
         observation=None, intent=None, datacolumn=None, imagename=None, imsize=None, cell=None, phasecenter=None,
         stokes=None, projection=None, startmodel=None, sdimage=None, sdpsf=None, sdgain=None, specmode=None,
-        reffreq=None, spectralindex=None, nchan=None, start=None, width=None, outframe=None, veltype=None,
+        reffreq=None, spectralindex=None, nterms=None, nchan=None, start=None, width=None, outframe=None, veltype=None,
         restfreq=None, interpolation=None, perchanweightdensity=None, gridder=None, onepointing=None, wprojplanes=None,
         usepointing=None, mosweight=None, pblimit=None, weighting=None, robust=None, npixels=None, uvtaper=None,
         restoration=None, restoringbeam=None, pbcor=None, method=None, niter=None, wavelets=None, wavelevels=None,

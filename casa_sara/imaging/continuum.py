@@ -12,6 +12,7 @@ from casa_sara.casa.images.image_files import read_model
 from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, read_pixels
 from casa_sara.casa.images.masks import read_support
 from casa_sara.casa.images.products import write_images, write_products
+from casa_sara.casa.images.restore import restored_beam
 from casa_sara.casa.images.spectral_index import with_spectrum
 from casa_sara.casa.ms.block_selection import divide
 from casa_sara.casa.ms.read import read_visibilities
@@ -45,8 +46,10 @@ from casa_sara.imaging.run_solver import (
     solve_image,
     without_wild,
 )
+from casa_sara.imaging.spectra import divided_by_band, spectral_images, with_subbands
 from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
 from casa_sara.imaging.total_power import total_power
+from casa_sara.operators.subbands import Subbands
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, ImagingRequest
 from casa_sara.parallel.serial import SERIAL, Serial
@@ -71,8 +74,8 @@ class Result:
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
     from the data, relative to the MS weights; `forecast` is the forecast of memory and time made before; `suspects`
-    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`. With several ranks, each has its own samples in
-    `data`, and `size` is the number of all.
+    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`; `subbands` are those of unknown spectra. With
+    several ranks, each has its own samples in `data`, and `size` is the number of all.
     """
 
     data: Visibilities
@@ -84,6 +87,7 @@ class Result:
     model_flux: float
     forecast: dict
     suspects: list = field(default_factory=list)
+    subbands: Subbands | None = None
 
     @property
     def finished(self) -> bool:
@@ -136,15 +140,17 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
             data, plane = _read(request, ranks)
         if output.images_stand:
             return _complete(request, plane, data, forecast, comm)
-        part = split(data, output.blocks, comm)
+        part = split(data, output.blocks, comm, plane.grid.subbands)
         del data  # the same samples, not yet sorted
         _check(request, plane, part, comm)
         watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
         solution = _solve(request, plane, part, watch, ranks)
-        images = plane_images(solution.part.data, solution.model, plane.grid, request.weighting, request.options,
+        images = plane_images(solution.part.data, solution.seen, plane.grid, request.weighting, request.options,
                               plane.image_plane, comm)
+        images.pixels["model"] = solution.model
         doubtful = _look_back(images, plane, solution, comm)
-        result = solution.result(images, doubtful, replace(forecast, iteration_s=watch.pace.seconds), comm)
+        forecast = replace(forecast, iteration_s=watch.pace.seconds)
+        result = solution.result(images, doubtful, forecast, plane.grid.subbands, comm)
         comm.once(_write, request, plane, images, solution.reconstruction, record and record(result), child)
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
@@ -176,17 +182,23 @@ class _Solution:
     part: Split
     reconstruction: Reconstruction | None = None
 
-    def result(self, images, doubtful, forecast, comm):
+    @property
+    def seen(self):
+        """The model, at all frequencies that were solved for where these are several."""
+        spectra = self.reconstruction and self.reconstruction.spectra
+        return self.model if spectra is None else spectra
+
+    def result(self, images, doubtful, forecast, subbands, comm):
         """Return what the task tells of it."""
         data, blocks = self.part.data, self.part.blocks
         return Result(data, comm.total(data.size), blocks, self.part.noise, self.reconstruction, images.residual_peak,
-                      images.model_flux, forecast.summary(), doubtful)
+                      images.model_flux, forecast.summary(), doubtful, subbands)
 
 
 def _read(request, ranks):
     """Return this rank's visibilities, and the plane of the image with its first model and support."""
     grid, output, comm = request.grid, request.output, ranks.comm
-    frequencies = bool(grid.spectralindex) or grid.is_mosaic
+    frequencies = grid.needs_frequencies
     data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks)
     data.notes.extend(check_pointings(data, grid))
     if grid.is_mosaic:
@@ -201,7 +213,7 @@ def _read(request, ranks):
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
     _caution(data)
-    grid = comm.once(with_spectrum, grid, plane)
+    grid = comm.once(with_spectrum, with_subbands(grid, data, plane), plane)
     start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
     if output.images_stand:
         return data, _Plane(plane, grid, start)
@@ -269,10 +281,13 @@ def _write(request, plane, images, reconstruction, record, child):
     errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
     if "model.error" in errors:
         errors["draws"] = draws.arrays()
+    if reconstruction and reconstruction.spectra is not None:
+        beam = restored_beam(list(request.output.restoringbeam or ()), images.beam)
+        errors |= spectral_images(reconstruction, plane.grid, beam)
     write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child)
 
 
-def split(data, blocks, comm=SERIAL):
+def split(data, blocks, comm=SERIAL, subbands=None):
     """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`).
 
     Parameters
@@ -283,12 +298,14 @@ def split(data, blocks, comm=SERIAL):
         As of :class:`casa_sara.options.Output`.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
+    subbands : Subbands, optional
+        Parts of the band that have blocks of their own.
 
     Returns
     -------
     Split
     """
-    block_of_sample, infos = divide(data, blocks, comm)
+    block_of_sample, infos = divided_by_band(*divide(data, blocks, comm), data, subbands)
     data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
     noise = noise_from_differences(data, offsets, comm)
     return Split(data, infos, offsets, noise)

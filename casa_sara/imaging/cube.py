@@ -19,6 +19,7 @@ from casa_sara.imaging.predict_model import save_model
 from casa_sara.imaging.run_solver import checkpoint_of
 from casa_sara.imaging.time_forecast import writing_seconds
 from casa_sara.options import ImagingRequest
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.runtime.deadline import Deadline
 from casa_sara.runtime.signals import stop_on_interrupt
@@ -58,67 +59,106 @@ class CubeResult:
         return EMPTY_MASK if channel.closed else self.stopped or ITERATION_LIMIT
 
 
-def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | None = None) -> CubeResult:
+def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | None = None,
+              comm: Serial = SERIAL) -> CubeResult:
     """Image a selection of MeasurementSets channel by channel, and write the products.
 
-    Parameters and errors as of :func:`casa_sara.imaging.continuum.make_image`.
+    Parameters and errors as of :func:`casa_sara.imaging.continuum.make_image`. Ranks share the channels: each reads all
+    data and solves its channels by itself, so that these are to the last bit those of one process. Rank 0 has the
+    result of all, the others of their own.
     """
     grid, output, deadline = request.grid, request.output, Deadline(request.limits.maxtime_s)
-    forecast, _ = forecast_run(request.selection, grid, request.options, request.limits)
-    forecast.require(request.limits.maxmem_gb)
-    checkpoint = CubeCheckpoint(checkpoint_of(request))
+    forecast, _ = forecast_run(request.selection, grid, request.options, request.limits, comm)
+    comm.together(forecast.require, request.limits.maxmem_gb)
+    checkpoint = CubeCheckpoint(checkpoint_of(request), comm)
     if output.resume:
-        checkpoint.file.open()
+        comm.together(checkpoint.open)
     # read
     with kernels_loading(log.info):
-        data = read_visibilities(request.selection, grid.phasecenter, grid.stokes)
+        data = comm.together(read_visibilities, request.selection, grid.phasecenter, grid.stokes)
     data.notes.extend(check_pointings(data, grid) + image_limits(data, grid))
-    cube = CubePlanes.of(request, data, forecast.workload.channels)
-    check_imagename(output.imagename, cube.plane.pb.shape, 2 * output.pbcor + grid.masked)
+    cube = CubePlanes.of(request, data, forecast.workload.channels, comm)
+    comm.once(check_imagename, output.imagename, cube.plane.pb.shape, 2 * output.pbcor + grid.masked)
     for note in data.notes:
         log.warn(note)
     # the dirty cube: errors of weights and beams are raised before the long part
-    for k in cube.filled:
-        cube.make_dirty(k)
+    comm.together(_make_dirty, cube, comm)
     # solve
     stopped = 0
     if request.options.niter > 0:
-        checkpoint.identify(visibilities=data.vis, weights=data.weight, uvw=data.uvw, channels=cube.order,
-                            support=cube.support)
+        comm.together(checkpoint.identify, visibilities=data.vis, weights=data.weight, uvw=data.uvw,
+                      channels=cube.order, support=cube.support)
         deadline.reserve = cube.plane.channels * writing_seconds(0, grid.shape) + after_iterations(
             data.size, (0,), output, request.limits, deadline.elapsed())
-        stopped = _solve_channels(cube, checkpoint, deadline)
+        stopped = comm.largest(_solve_channels(cube, checkpoint, deadline, comm))
+    cube.gather(comm)
     # write
-    tally = Tally(data.size, data.dropped, tuple(data.notes))
+    tally = Tally(data.size, data.dropped, (*data.notes, *cube.found))
     result = CubeResult(tally, cube.channels, cube.axis.frame, forecast.summary(), stopped)
     if not output.images_stand:
-        with waiting_child(write_images) as child:
-            write_products(output, cube.plane, cube.products(), [channel.sumwt for channel in cube.channels],
-                           cube.beams(), record and record(result), child)
-    if result.finished or not checkpoint.file.stands:  # else one of an older run
-        checkpoint.file.remove()
+        comm.once(_write, request, cube, record and record(result))
+    checkpoint.clear(result.finished)
     if output.savemodel == "modelcolumn":
-        save_model(request.selection, data, grid, request.options, cube.images["model"], cube.axis)
+        comm.once(save_model, request.selection, data, grid, request.options, cube.images["model"], cube.axis)
     return result
 
 
-def _solve_channels(cube, checkpoint, deadline):
-    """Solve one channel after the other; return the code of what ended that early, 0 where nothing did."""
+def _make_dirty(cube, comm):
+    """Make the dirty images of this rank's channels."""
+    for k in cube.filled[comm.rank :: comm.size]:
+        cube.make_dirty(k)
+
+
+def _write(request, cube, record):
+    """Write the products."""
+    with waiting_child(write_images) as child:
+        write_products(request.output, cube.plane, cube.products(), [channel.sumwt for channel in cube.channels],
+                       cube.beams(), record, child)
+
+
+def _solve_channels(cube, checkpoint, deadline, comm):
+    """Solve this rank's channels one after the other; return the code of what ended that early, 0 where nothing did.
+
+    What ends it on one rank ends it on all.
+    """
+    own = [k for k in cube.filled[comm.rank :: comm.size] if k in cube.solvable]
+    watch = _Deadline(deadline, comm)
     with stop_on_interrupt() as pressed:
-        for k in cube.solvable:
-            if pressed():
-                checkpoint.keep(-1, lambda: None, 0, now=True)
-                return STOPPED_BY_USER
-            reconstruction = checkpoint.finished.get(k)
-            if reconstruction is None:
-                of_channel = checkpoint.of(k)
-                reconstruction = cube.solve(k, of_channel, deadline)
-                code = reconstruction.record.stop_code
-                if code in UNFINISHED:
-                    cube.take(k, reconstruction)
-                    if not of_channel.kept:
-                        checkpoint.keep(-1, lambda: None, 0, now=True)
-                    return code
-                checkpoint.finish(k, reconstruction)
-            cube.take(k, reconstruction)
+        code = _solve_own(cube, own, checkpoint, watch, pressed)
+        if code:
+            comm.ask_stop(code)
+        comm.meet(lambda: pressed() and comm.ask_stop(STOPPED_BY_USER))
+    return code
+
+
+def _solve_own(cube, own, checkpoint, watch, pressed):
+    """Solve channels one after the other; return the code of what ended that early."""
+    for k in own:
+        if pressed() or watch.asked():
+            checkpoint.keep(-1, lambda: None, 0, now=True)
+            return watch.asked() or STOPPED_BY_USER
+        reconstruction = checkpoint.finished.get(k)
+        if reconstruction is None:
+            of_channel = checkpoint.of(k)
+            reconstruction = cube.solve(k, of_channel, watch)
+            code = reconstruction.record.stop_code
+            if code in UNFINISHED:
+                code = reconstruction.record.stop_code = watch.asked() or code
+                cube.take(k, reconstruction)
+                if not of_channel.kept:
+                    checkpoint.keep(-1, lambda: None, 0, now=True)
+                return code
+            checkpoint.finish(k, reconstruction)
+        cube.take(k, reconstruction)
     return 0
+
+
+class _Deadline:
+    """The deadline of a rank: that of the run, or at once where another rank has ended."""
+
+    def __init__(self, deadline, comm):
+        self._deadline, self.asked = deadline, comm.stop_asked
+
+    def near(self):
+        """Return whether to stop now."""
+        return bool(self.asked()) or self._deadline.near()

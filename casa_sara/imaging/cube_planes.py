@@ -19,6 +19,7 @@ from casa_sara.imaging.plane_images import plane_images
 from casa_sara.imaging.run_solver import Watch, density_of, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace
 from casa_sara.options import ImagingRequest
+from casa_sara.parallel.serial import SERIAL
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.settings import check_l2bound, schedule_of
 
@@ -52,7 +53,8 @@ class Channel:
 class CubePlanes:
     """The images of all channels so far: `images` are 'psf', 'residual' and 'model', float32 (nchan, nx, ny).
 
-    `support` bool (nchan, nx, ny), None without a mask, is where the model of each channel may be.
+    `support` bool (nchan, nx, ny), None without a mask, is where the model of each channel may be; `found` are notes on
+    the solutions. With several ranks, each has its channels, until they are gathered.
     """
 
     request: ImagingRequest
@@ -64,11 +66,12 @@ class CubePlanes:
     channels: list[Channel]
     support: np.ndarray | None = None
     images: dict[str, np.ndarray] = field(default_factory=dict)
+    found: list[str] = field(default_factory=list)
 
     @classmethod
-    def of(cls, request, data, planes):
+    def of(cls, request, data, planes, comm=SERIAL):
         """Lay out the axis and sort the samples by channel; there are no images yet."""
-        plane = define_image_plane(data, request.selection, request.grid, request.output.pblimit, planes)
+        plane = comm.once(define_image_plane, data, request.selection, request.grid, request.output.pblimit, planes)
         data.notes.extend(plane.notes)
         if not plane.mask.any():
             data.notes.append(nowhere_visible(request.grid, request.output))
@@ -87,7 +90,7 @@ class CubePlanes:
         if first[0]:
             log.info(f"{first[0]} visibilities are in none of the {axis.size} image channels")
         plane = replace(plane, mask=plane.mask & ~blank[:, None, None])
-        support = None if request.output.images_stand else read_support(request.grid, plane)
+        support = None if request.output.images_stand else comm.once(read_support, request.grid, plane)
         closed = np.zeros(axis.size, bool) if support is None else ~support.any(axis=(1, 2))
         if (closed & ~blank).any():
             numbers = ", ".join(map(str, np.flatnonzero(closed & ~blank)))
@@ -145,7 +148,31 @@ class CubePlanes:
             sigma = thermal_noise(data, weights, part.noise, np.searchsorted(reconstruction.kept, part.offsets))
             for note in left_outside(self.images["residual"][k], self.support[k], sigma):
                 log.warn(f"channel {k}: {note}")
-                self.data.notes.append(f"channel {k}: {note}")
+                self.found.append(f"channel {k}: {note}")
+
+    def gather(self, comm):
+        """Bring the channels of all ranks to rank 0, which says in the log what the others have found."""
+        shares = [self.filled[rank :: comm.size] for rank in range(comm.size)]
+        for cube in self.images.values():
+            for own, part in zip(shares, comm.gather(cube[shares[comm.rank]]) or ()):
+                cube[own] = part
+        told = [self.channels[k] for k in shares[comm.rank]], self.found
+        for rank, theirs in enumerate(comm.alltoall([told] + [None] * (comm.size - 1))):
+            if comm.rank == 0 and rank > 0:
+                self._take_over(shares[rank], *theirs)
+
+    def _take_over(self, numbers, channels, found):
+        """Take the channels of another rank, and say in the log how they ended."""
+        for k, channel in zip(numbers, channels):
+            self.channels[k] = channel
+            solved = channel.result.reconstruction
+            if solved:
+                record = solved.record
+                log.info(f"channel {k}: {record.stop_description}, after {record.iteration[-1]} iterations: model flux "
+                         f"{channel.result.model_flux:.5g} Jy, {len(record.islands)} islands")
+        for note in found:
+            log.warn(note)
+        self.found.extend(found)
 
     def products(self):
         """Return the images to be written."""

@@ -60,7 +60,7 @@ def checkpoint_of(request: ImagingRequest) -> Checkpoint:
     parameters = asdict(request.selection) | asdict(request.grid) | asdict(request.options)
     parameters |= dict(blocks=output.blocks, startmodel=startmodel)
     parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
-    for name in ("vis", "nthreads", "spectrum", "mosaic"):
+    for name in ("vis", "nthreads", "spectrum", "mosaic", "subbands"):
         del parameters[name]
     return Checkpoint(output.imagename + CHECKPOINT, __version__, parameters, log.info, log.warn)
 

@@ -54,6 +54,7 @@ TSARA = (
     Parameter('specmode', ('string',), 'mfs', 'Spectral definition mode (mfs, cube)', allowed=('mfs', 'cube')),
     Parameter('reffreq', ('string',), '', 'Reference frequency', opener='specmode', open_on=('mfs',)),
     Parameter('spectralindex', ('string', 'double'), '', "Known spectral index of the sky: a number, or an image of it; '': flat", opener='specmode', open_on=('mfs',)),
+    Parameter('nterms', ('int',), 1, 'Terms of the spectra that are solved for; 1: flat, or of a known index', opener='specmode', open_on=('mfs',)),
     Parameter('nchan', ('int',), -1, 'Number of channels in the output image', opener='specmode', open_on=('cube',)),
     Parameter('start', ('int', 'string'), '', "First channel (e.g. start=3, start='1.1GHz', start='15343km/s')", opener='specmode', open_on=('cube',)),
     Parameter('width', ('int', 'string'), '', "Channel width (e.g. width=2, width='0.1MHz', width='10km/s')", opener='specmode', open_on=('cube',)),

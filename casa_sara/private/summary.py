@@ -149,6 +149,9 @@ def _sara(result, options, full):
         "nthreads": options.nthreads,
         "forecast": dict(result.forecast),
     }
+    if result.subbands is not None:
+        sara["spectra"] = {"frequencies_hz": result.subbands.freqs_hz, "reference_hz": result.subbands.reference_hz,
+                           "shares": result.subbands.shares}
     return sara | _solution(result, options, full)
 
 
@@ -195,6 +198,8 @@ def _block(result, j):
         "samples": block.samples,
         "noise_measured": float(result.noise[j]),
     }
+    if block.band_hz:
+        entry["band_hz"] = list(block.band_hz)
     if solved:
         entry["l2_bound"] = float(solved.l2_bounds[j])
         entry["residual_norm"] = float(solved.residual_norms[j])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +48,7 @@ from casa_sara.version import __version__
 __all__ = ["selection_of", "tsara"]
 
 ARCSEC = math.pi / 180 / 3600
+MOST_TERMS = 6
 
 
 def tsara(**parameters: Any) -> dict[str, Any]:
@@ -56,6 +56,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     _check_method(parameters)
     _refuse_for_mosaics(parameters)
     _check_single_dish(parameters)
+    _refuse_for_spectra(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -78,12 +79,12 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
                          "in the first lines of the log of a normal run, and docs/parallel.md explains its time")
     if parameters["dryrun"]:
         return {"forecast": dry_run(selection, grid, options, _blocks(parameters), limits)}
-    make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
+    make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
         dish = SingleDish(parameters["sdimage"], parameters["sdpsf"], parameters["sdgain"])
         result = make(ImagingRequest(selection, grid, weighting, options, output, limits, dish),
-                      lambda result: tell(result, options, full=True)["sara"])
+                      lambda result: tell(result, options, full=True)["sara"], comm)
         if parameters["report"]:
             comm.once(_report, output.imagename, selection, options.nthreads, grid.is_cube)
         elif not output.images_stand:
@@ -147,7 +148,8 @@ def _grid(parameters):
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
                      spectralindex=_spectral_index(parameters), usemask=parameters["usemask"], mask=_mask(parameters),
-                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], **_spectral(parameters))
+                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], nterms=parameters["nterms"],
+                     **_spectral(parameters))
 
 
 def _spectral_index(parameters):
@@ -174,9 +176,6 @@ def _refuse_for_cubes(parameters):
     """Raise on parameters that are for continuum images only."""
     if parameters["specmode"] != "cube":
         return
-    if parameters["parallel"]:
-        raise ValueError("parallel = True with specmode = 'cube': only continuum images can be shared by several "
-                         "processes; should be False. Channels can be divided among several runs with start and nchan")
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
@@ -221,11 +220,33 @@ def _check_single_dish(parameters):
                                 ("method", "tsara", "the paper has no total power"),
                                 ("databound", "adapt", "the noise of sdimage is found, it has no weights"),
                                 ("spectralindex", "", "the sky has to be the same at all frequencies"),
+                                ("nterms", 1, "the sky has to be the same at all frequencies"),
                                 ("ndraws", 0, "its errors are not found by bootstrap"),
                                 ("jackknife", False, "its errors are not found by jackknife"),
                                 ("parallel", False, "total power takes one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with sdimage = '{image}': {reason}; should be {right!r}")
+
+
+def _refuse_for_spectra(parameters):
+    """Raise on parameters that unknown spectra do not have."""
+    nterms = parameters["nterms"]
+    if not 1 <= nterms <= MOST_TERMS:
+        raise ValueError(f"nterms = {nterms}: should be from 1 to {MOST_TERMS}")
+    if nterms == 1:
+        return
+    for name, right, reason in (("gridder", "standard", "other operators are of flat, or of known spectra"),
+                                ("method", "tsara", "the paper's method has one image"),
+                                ("stokes", "I", "spectra are those of the brightness"),
+                                ("positivity", True, "the brightness is positive at all frequencies"),
+                                ("spectralindex", "", "either the index is known, or it is solved for"),
+                                ("parallel", False, "spectra take one process"),
+                                ("report", False, "reports are made of one image"),
+                                ("savemodel", "none", "MODEL_DATA is written of one image"),
+                                ("ndraws", 0, "errors by bootstrap are of one image"),
+                                ("jackknife", False, "errors by jackknife are of one image")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 
 
 def _check_stokes(parameters):

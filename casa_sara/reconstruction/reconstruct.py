@@ -200,8 +200,9 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
         name: digest(whole) for name, array in gathered.items()
         if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
     spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
+    subbands = grid.subbands and grid.subbands.freqs_hz
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
-        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex,
+        blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex, subbands=subbands,
         sensitivity=grid.mosaic and grid.mosaic.over,
         sdimage=samples.total_power and samples.total_power.values).items()}
     comm.once(checkpoint.identify, **digests)
@@ -248,6 +249,7 @@ def _result(solution, record, samples, averaging, comm, goes_on):
     if record.stop_code == CONVERGED and (found.noise_only or not model.any()):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
+    subbands = solution.subbands
     blocks = len(samples.offsets) - 1
     total_power = {}
     if solution.dish is not None:
@@ -256,10 +258,12 @@ def _result(solution, record, samples, averaging, comm, goes_on):
             f"{name}_jy_per_beam": float(norms[-1] / np.sqrt(2 * ppd.samples[-1]) / solution.dish.scale)
             for name, norms in whitened.items()}
     return Reconstruction(
-        model, bounds.l2_bounds[:blocks], ppd.residual_norms[:blocks].copy(), found.nnls_norms[:blocks], record,
+        ppd.planes.at_reference(model), bounds.l2_bounds[:blocks], ppd.residual_norms[:blocks].copy(),
+        found.nnls_norms[:blocks], record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
         wild=found.wild, averaging=averaging, total_power=total_power,
+        spectra=None if subbands is None else subbands.spectra(model),
         **{name: resampling.draws for name, resampling in resamplings.items()})
 
 

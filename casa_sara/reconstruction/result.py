@@ -45,6 +45,8 @@ class Reconstruction:
         `alone_jy_per_beam`, the noise from what an image of the dish alone leaves; empty without one.
     draws, jackknife : Draws or None
         Of the bootstrap and of the jackknife, where asked for and the solution has come to an end.
+    spectra : float32 (T, nx, ny) or None
+        The model at several frequencies, Jy/pixel, where it was solved for at these; `model` is that at the reference.
     """
 
     model: np.ndarray
@@ -61,6 +63,7 @@ class Reconstruction:
     total_power: dict = field(default_factory=dict)
     draws: Draws | None = None
     jackknife: Draws | None = None
+    spectra: np.ndarray | None = None
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Reconstruction:

@@ -187,8 +187,8 @@ class _tsara:
                 brightness at all frequencies, unless spectralindex gives its spectral index. A
                 source of another spectrum is averaged over the band; in a wide band this leaves
                 errors around it that no model can fit (with a spectral index of -0.8 it loses 43 %
-                of its brightness from 1 to 2 GHz). The frequency dependence of the primary beam is
-                not modelled.
+                of its brightness from 1 to 2 GHz), and nterms > 1 solves for it. The frequency
+                dependence of the primary beam is not modelled.
         'cube'  an image of each channel, on the spectral axis that tclean makes of the same
                 parameters. The channels are solved one after the other, each from its own data,
                 with its own blocks, bounds and beam; niter and the blocks are those of a channel.
@@ -211,6 +211,22 @@ class _tsara:
         (tclean has no such parameter.)
         Examples: spectralindex=-0.7
                   spectralindex='clean.alpha'
+
+    nterms : int, default 1
+        Opened by specmode = 'mfs'.
+        With 2 or more, the spectrum of every pixel is solved for together with its brightness: as a
+        polynomial of so many terms in the logarithm of the frequency, that is, by images at so many
+        frequencies, none of them negative. Mean, slope, curvature … of the spectra are sparse each,
+        so that where the data show no slope the spectrum is flat. 3 serve an octave, 2 a band of 20
+        percent. .model, .image and .residual are at reffreq; .alpha is the spectral index of the
+        model smoothed to the beam of .psf, .alpha.error its error by the noise, both masked where
+        that is above 0.3; .subbands is the model at the frequencies that were solved for. Blocks
+        are divided by frequency, too. Memory and time go with nterms. As in tclean the spectra are
+        those of the sky as seen by the antennas, whose primary beam becomes narrower with
+        frequency: beyond the middle of the field .alpha is steeper than that of the sky. Only with
+        gridder='standard', and not with spectralindex, report, savemodel, ndraws, jackknife,
+        parallel.
+        Example: nterms=3
 
     nchan : int, default -1
         Opened by specmode = 'cube'.
@@ -608,8 +624,8 @@ class _tsara:
         script.py", where every rank calls the task, or with "mpicasa -n 5 casa -c script.py", where
         casampi's client has its servers do it. It takes mpi4py (pip install casa_sara[mpi]) and Open
         MPI or MPICH. nthreads, and maxmem, are those of each rank; nthreads=0 shares the cores of a
-        machine among its ranks. See docs/parallel.md. False runs in one process, with nthreads
-        threads.
+        machine among its ranks. Of a cube, each rank solves some of the channels, and needs the memory
+        of one process. See docs/parallel.md. False runs in one process, with nthreads threads.
 
     Returns
     -------
@@ -658,7 +674,7 @@ class _tsara:
         self, vis='', selectdata=True, field='', spw='', timerange='', uvrange='', antenna='', scan='', observation='',
         intent='', datacolumn='corrected', imagename='', imsize=[100], cell=[], phasecenter='', stokes='I',
         projection='SIN', startmodel='', sdimage='', sdpsf='', sdgain=1.0, specmode='mfs', reffreq='', spectralindex='',
-        nchan=-1, start='', width='', outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest',
+        nterms=1, nchan=-1, start='', width='', outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest',
         perchanweightdensity=True, gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False,
         mosweight=True, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True,
         restoringbeam=[], pbcor=False, method='tsara', niter=100000,

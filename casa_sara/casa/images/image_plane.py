@@ -81,6 +81,25 @@ class ImagePlane:
         mask = pb > abs(pblimit)
         return replace(self, pb=np.where(mask, pb, np.float32(0)), mask=mask, sky_model=True)
 
+    def csys_at(self, freqs_hz):
+        """Return the record of the same coordinates, but for the frequencies.
+
+        Parameters
+        ----------
+        freqs_hz : float (n,)
+            Of the planes of a cube.
+
+        Returns
+        -------
+        dict
+        """
+        import casatools
+
+        csys = casatools.coordsys()
+        csys.fromrecord(self.csys)
+        csys.setspectral(frequencies=casatools.quanta().quantity(list(freqs_hz), "Hz"))
+        return csys.torecord()
+
     @property
     def channels(self) -> int:
         """Planes along the spectral axis."""

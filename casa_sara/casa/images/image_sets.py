@@ -41,6 +41,8 @@ class ImageSet:
         What tsara recorded, else empty.
     draws : str
         File of the draws of a bootstrap, '' where there is none.
+    spectra : str
+        Image of the model at several frequencies, '' where its spectra were not solved for.
     """
 
     name: str
@@ -50,6 +52,7 @@ class ImageSet:
     parameters: dict[str, str] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
     draws: str = ""
+    spectra: str = ""
 
     def called(self, name):
         """Return the same with another name."""
@@ -111,7 +114,7 @@ def read_image_set(given, name="", with_residual=True, cube=False):
     record = root + RECORD
     return ImageSet(name or os.path.basename(root), model, residual, next(filter(None, beams), None),
                     parameters | model.parameters, read_record(record) if os.path.isfile(record) else {},
-                    root + DRAWS if os.path.isfile(root + DRAWS) else "")
+                    root + DRAWS if os.path.isfile(root + DRAWS) else "", _beside(root, ".subbands"))
 
 
 def read_frames(names, plane):
