@@ -12,7 +12,7 @@ from casa_sara.casa.images.single_dish import read_dish_image
 from casa_sara.casa.runtime import log
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.demo.single_dish import ARCSEC, dish_image, observe_with_dish
-from casa_sara.imaging.run_solver import AT_ODDS
+from casa_sara.imaging.run_solver import at_odds
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.operators.single_dish import GaussianBeam, ImagedBeam, Points, SingleDishOperator, Stacked
 from casa_sara.options import ImageGrid, SolverOptions
@@ -234,7 +234,7 @@ def test_gain_and_beam_image(extended, dish, folder, tmp_path, monkeypatch):
     for gain, told in ((1.0, False), (1.5, True)):
         power = tsara(vis=extended, imagename="odd", sdimage=dish, sdgain=gain, overwrite=True,
                       **OPTIONS | dict(uvrange=""))["sara"]["total_power"]
-        assert told == (power["residual_jy_per_beam"] > AT_ODDS * power["alone_jy_per_beam"])
+        assert told == at_odds(power)
 
 
 @pytest.mark.slow

@@ -31,9 +31,9 @@ from casa_sara.solver.nnls import NNLS_ITERATIONS
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
 from casa_sara.version import __version__
 
-__all__ = ["Watch", "checkpoint_of", "density_of", "expected_iterations", "solve_image", "without_wild"]
+__all__ = ["Watch", "at_odds", "checkpoint_of", "density_of", "expected_iterations", "solve_image", "without_wild"]
 
-AT_ODDS = 3.0  # times as much as a single dish alone leaves, from which on a residual is a warning
+AT_ODDS, OF_BRIGHTEST = 3.0, 0.02  # times what a single dish alone leaves, and of its brightest point: a warning
 MOST_NAMED = 20  # wild samples that the log names one by one
 
 
@@ -188,11 +188,23 @@ def _log_total_power(found):
         return
     log.info("total power: noise found {noise_jy_per_beam:#.3g} Jy/beam, rms of the residual "
              "{residual_jy_per_beam:#.3g} Jy/beam at {points} points".format(**found))
-    if found["residual_jy_per_beam"] > AT_ODDS * found["alone_jy_per_beam"]:
+    if at_odds(found):
         log.warn("sdimage and vis are at odds: the rms of what the model leaves of sdimage is "
                  "{residual_jy_per_beam:.3g} Jy/beam, of what an image of sdimage alone leaves {alone_jy_per_beam:.3g} "
                  "Jy/beam. Their flux scales may differ (sdgain), or their positions, or the beam of sdimage"
                  .format(**found))
+
+
+def at_odds(found: dict[str, float]) -> bool:
+    """Return whether a single dish and the visibilities contradict each other.
+
+    Parameters
+    ----------
+    found : dict
+        `total_power` of :class:`casa_sara.reconstruction.result.Reconstruction`.
+    """
+    least = max(AT_ODDS * found["alone_jy_per_beam"], OF_BRIGHTEST * found["brightest_jy_per_beam"])
+    return found["residual_jy_per_beam"] > least
 
 
 class _Drawing:

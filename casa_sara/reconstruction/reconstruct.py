@@ -254,7 +254,9 @@ def _result(solution, record, samples, averaging, comm, goes_on):
     total_power = {}
     if solution.dish is not None:
         whitened = dict(noise=bounds.l2_bounds, residual=ppd.residual_norms, alone=found.nnls_norms)
-        total_power = dict(points=samples.total_power.values.size) | {
+        values = samples.total_power.values
+        brightest = float(np.abs(values).max())
+        total_power = dict(points=values.size, brightest_jy_per_beam=brightest) | {
             f"{name}_jy_per_beam": float(norms[-1] / np.sqrt(2 * ppd.samples[-1]) / solution.dish.scale)
             for name, norms in whitened.items()}
     return Reconstruction(

@@ -41,8 +41,9 @@ class Reconstruction:
         of each block's, and the `largest_error` of the averages of the first image in units of their noise; empty where
         they were not.
     total_power : dict
-        Number of `points` of a single dish, `noise_jy_per_beam` found of them, rms `residual_jy_per_beam`, and
-        `alone_jy_per_beam`, the noise from what an image of the dish alone leaves; empty without one.
+        Number of `points` of a single dish, the `brightest_jy_per_beam`, `noise_jy_per_beam` found of them, rms
+        `residual_jy_per_beam`, and `alone_jy_per_beam`, the noise from what an image of the dish alone leaves; empty
+        without one.
     draws, jackknife : Draws or None
         Of the bootstrap and of the jackknife, where asked for and the solution has come to an end.
     spectra : float32 (T, nx, ny) or None

@@ -233,7 +233,9 @@ class AdaptiveBounds(_NoiseLevels):
     def _off_target(self, ppd, slack=1.0):
         """Condition (iii): blocks whose residual norm, or floor, is further than slack × γ2 from the bound."""
         target = np.maximum(ppd.residual_norms, self._lowest())
-        return np.abs(target - self.l2_bounds) > slack * self.tol * self.l2_bounds
+        # what few samples know of their own noise is 1/√(4M)
+        tol = np.where(np.isfinite(self.most), np.maximum(self.tol, 0.5 / np.sqrt(self.samples)), self.tol)
+        return np.abs(target - self.l2_bounds) > slack * tol * self.l2_bounds
 
     def _lowest(self):
         """The lowest bounds at the present noise of the other blocks."""
