@@ -170,7 +170,7 @@ def test_the_solution_of_enlarged_cells_is_that_of_all_samples_within_a_tenth_of
 def test_cells_are_enlarged_where_there_are_more_averages_than_pixels(monkeypatch):
     samples, _ = observed(20)
     told = []
-    monkeypatch.setattr("casa_sara.reconstruction.problem.math.prod", lambda shape: 1000)
+    monkeypatch.setattr("casa_sara.reconstruction.problem.prod", lambda shape: 1000)
     found = reconstruct(samples, GRID, replace(OPTIONS, niter=2), control=Control(tell=told.append))
     side = 2 * averaging_cell(GRID)[1]
     assert found.averaging["averages"] == 924 and found.averaging["cell_wavelengths"][0] == side

@@ -38,7 +38,7 @@ DISK_SAMPLE = 102  # bytes of a sample there: 46 of it, 28 of the operator, 12 o
 WRITER = 130_000_000  # bytes of the process that writes the images, while it waits
 
 
-def forecast_run(selection, grid, options, limits, comm=SERIAL, blocks=0):
+def forecast_run(selection, grid, options, limits, comm=SERIAL, blocks=0, disk=True):
     """Share a run among the ranks, and forecast the memory of this one, from the numbers of rows, channels and pixels.
 
     Rank 0 says its own in the log. Flags are read only where the run would not fit with all samples. Many samples, and
@@ -64,7 +64,7 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL, blocks=0):
         ranks = ALONE if grid.is_cube else assign_ranks(  # each rank has its channels, and reads all
             comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
         found = memory_of(ranks)
-        if (_may_be_on_disk(grid, options, limits, comm)
+        if (disk and _may_be_on_disk(grid, options, limits, comm)
                 and (volume.samples >= MANY or volume.samples >= LEAST and not found.fits)):
             work = replace(found.workload, on_disk=True, blocks=blocks if isinstance(blocks, int) else 0)
             found = forecast(work, resident, available, limits.maxmem_gb)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import inf, prod
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,12 @@ from casa_sara.data.visibilities import Visibilities
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
 from casa_sara.operators.piecewise import operator_on_disk
+from casa_sara.operators.single_dish import Stacked
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.total_power import Beside, TotalPower, WhitenedDish
 from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import NNLSFit, nnls
 
@@ -53,6 +55,8 @@ class Samples:
         Noise of each block measured from the data, in units of what the weights say; NaN where unknown.
     kept : int (M,)
         Numbers of the samples in the data given.
+    total_power : TotalPower, optional
+        What a single dish has measured, a block of its own after those of the samples.
     """
 
     data: Visibilities
@@ -60,6 +64,7 @@ class Samples:
     density: np.ndarray
     noise: np.ndarray | None = None
     kept: np.ndarray = field(default=None)  # type: ignore[arg-type]  # all of them: see below
+    total_power: TotalPower | None = None
 
     def __post_init__(self):
         self.offsets = np.asarray(self.offsets)
@@ -108,8 +113,9 @@ class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
     `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
-    `samples` where that is None. `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image
-    times `sky_over_image`; with `subbands` the images of several frequencies are stacked.
+    `samples` where that is None; those of a single `dish`, where there is one, come after them, a block of their own.
+    `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image times `sky_over_image`; with
+    `subbands` the images of several frequencies are stacked.
     """
 
     samples: Samples
@@ -122,6 +128,7 @@ class Problem:
     support: np.ndarray | None = None
     averaged: Averaged | None = None
     sky_over_image: np.ndarray | None = None
+    dish: WhitenedDish | None = None
     subbands: Any = None
 
     @classmethod
@@ -161,7 +168,7 @@ class Problem:
         operator = partial(sky_operator, grid=grid, eps=eps, nthreads=options.nthreads, comm=comm)
         vis: Any = None if data.scratch.on_disk else data.vis * np.sqrt(data.weight)
         measurement = _whitened_operator(data, operator, grid, options, unit_jy)
-        precond = _preconditioner(samples, options.precondition, comm, grid.subbands)
+        precond = of_samples = _preconditioner(samples, options.precondition, comm, grid.subbands)
         averaged = None
         if options.averages and grid.mosaic is None:
             averaged, uvw, freq_hz = _averages(partial(Averaged.of, data, offsets, averaging_cell(grid), vis=vis,
@@ -171,6 +178,15 @@ class Problem:
             precond = averaged.weighted_mean(precond).astype(np.float32)
             root_weight = np.sqrt(averaged.sum_of_weights, dtype=np.float32, casting="same_kind")
             measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy))
+        dish = None
+        if samples.total_power is not None:
+            dish = samples.total_power.whitened(grid.shape, float(data.weight.sum(dtype=float)), unit_jy,
+                                                measurement.workers)
+            alone = float(prod(grid.shape))  # of one sample
+            of_dish = dish.precond(_norm_sq(samples, of_samples, grid, unit_jy) if options.precondition else alone)
+            measurement = Stacked(measurement, dish.operator)
+            vis, precond = np.concatenate([vis, dish.vis]), np.concatenate([precond, of_dish])
+            offsets = np.append(offsets, vis.size)
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
             data_norm_sq = float(comm.bcast(power_method(
@@ -178,7 +194,18 @@ class Problem:
         if support is not None and grid.subbands is not None:
             support = np.tile(support, (grid.subbands.count, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
-                   grid.mosaic and grid.mosaic.over, grid.subbands)
+                   grid.mosaic and grid.mosaic.over, dish, grid.subbands)
+
+    @property
+    def renewing(self) -> Averaged | Beside | None:
+        """What makes the averages anew, None where there are none."""
+        return self.averaged if self.averaged is None or self.dish is None else Beside(self.averaged, self.dish.vis)
+
+    @property
+    def block_sizes(self) -> np.ndarray:
+        """Samples of each block on this rank, before they were averaged; int (d,)."""
+        sizes = np.diff(self.samples.offsets)
+        return sizes if self.dish is None else np.append(sizes, self.dish.vis.size)
 
     def flux_jy(self, image: np.ndarray) -> float:
         """Return Σ|I| of the sky of an image, which no visibility of it exceeds.
@@ -205,20 +232,20 @@ def _averages(average, samples, finer, grid, options):
     Unless `finer` says how large the cells are they are enlarged while there are more averages than pixels: to a phase
     of up to 0.4 rad, which those of samples on the disk have at once.
     """
-    enlarging = finer is None and not options.jackknife and grid.subbands is None
+    enlarging = finer is None and not options.jackknife and grid.subbands is None and samples.total_power is None
     on_disk, blocks = samples.data.scratch.on_disk, len(samples.offsets) - 1
     if finer is None:
         finer = np.full(blocks, -MOST_DOUBLINGS if on_disk and enlarging else 0)
     while True:
-        found, averages, most = (None, None, None), math.inf, math.inf
+        found, averages, most = (None, None, None), inf, inf
         with suppress(OverflowError):  # hardly two samples share one of so many cells
             found = average(finer)
             comm = found[0].comm
             averages, most = comm.total(found[0].cells.size), WORTHWHILE * comm.total(samples.data.size)
-        if not enlarging or averages <= math.prod(grid.shape) or finer.min() == -MOST_DOUBLINGS:
+        if not enlarging or averages <= prod(grid.shape) or finer.min() == -MOST_DOUBLINGS:
             break
         finer = finer - 1
-    if averages <= most < math.inf:
+    if averages <= most < inf:
         return found
     if on_disk:
         raise MemoryError(f"imsize = {list(grid.shape)}: the {samples.data.size} visibilities would be averaged to "
@@ -290,6 +317,7 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         problem = problem_of(samples, finer=finer)
         first, left = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                            NNLSFit(positivity=options.positivity), stopped, problem.support)
+        left = left[: left.size - (0 if problem.dish is None else problem.dish.vis.size)]
         residual = left if problem.averaged is None else problem.averaged.residual(first)
         error = _averaging_error(problem, residual, left, comm)
         used = problem.averaged.finer if problem.averaged else np.zeros(len(samples.offsets) - 1, int)
@@ -306,6 +334,8 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
     gone[samples.kept[samples.kept < everything]] = False
     left_out = np.flatnonzero(gone)
     norms = _norms(residual, samples.offsets, comm)
+    if problem.dish is not None:
+        norms = np.append(norms, problem.dish.noise_norm(options.positivity, problem.support))
     return problem, Findings(left_out, wild, norms, problem.data_norm_sq, used, float(error.max())), first
 
 
@@ -332,6 +362,13 @@ def _told_of_all(found, samples, layout, comm):
     """Return what is told of the wild samples of all ranks, in the order in which one rank alone has them."""
     numbered = zip(layout.numbers(samples.kept[found.index]).tolist(), found.named(samples.data))
     return [told for _, told in sorted(sum(comm.allgather(list(numbered)), []), key=lambda one: one[0])]
+
+
+def _norm_sq(samples, precond, grid, unit_jy):
+    """About ‖U^½Φ‖² of the visibilities, from what the samples of a uv cell have together, ΣUw, times the pixels."""
+    data = samples.data
+    of_cells = np.median(precond * samples.density * (data.weight / data.imaging_weight))
+    return float(of_cells) * prod(grid.shape) * unit_jy**2
 
 
 def _preconditioner(samples, wanted, comm, subbands=None):
