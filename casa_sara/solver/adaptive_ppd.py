@@ -441,4 +441,4 @@ class AdaptivePPD:
             setattr(self, name, state[name])
         self.l2_bounds = np.array(state["l2_bounds"])
         self.points = PointSources(state["points"])
-        self.correction = None if state["correction"] is None else np.array(state["correction"])
+        self.correction = None if state.get("correction") is None else np.array(state["correction"])
