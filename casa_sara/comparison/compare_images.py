@@ -47,7 +47,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     selection : Selection, optional
         The MeasurementSets and the data selected in them.
     single : bool
-        One product will do, for the report of one run.
+        One product will do, for the report of one run; it does to test features or to inject sources, too.
 
     Returns
     -------
@@ -58,7 +58,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     ValueError, FileNotFoundError
         The products cannot be compared; the message names the task parameter.
     """
-    sets = _read(request, selection is None, 1 if single else 2)
+    sets = _read(request, selection is None, 1 if single or request.features or request.inject else 2)
     first, notes = sets[0].model, []
     if first.plane.frame not in RADESYS:
         raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or "
