@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 __all__ = ["LARGEST_INDEX", "Comparing", "ImageGrid", "Limits", "Output", "Selection", "SolverOptions", "Spectrum",
-           "Weighting"]
+           "SingleDish", "Weighting"]
 
 LARGEST_INDEX = 5.0  # spectral index of any continuum, plus or minus
 
@@ -59,9 +59,10 @@ class ImageGrid:
     """The image plane and how it is seen: `shape` = (nx, ny) pixels of `cell_rad` = (x, y) radians, both positive.
 
     `spectrum` is what `spectralindex` stands for, once it has been read, and `mosaic` the primary beams of
-    gridder='mosaic', a :class:`casa_sara.operators.beams.Mosaic`. `start` and `width` of a cube's spectral axis are '',
-    a channel number or a quantity; `nchan` is -1 where the data tell it. `usemask`, `mask` and `pbmask` say where the
-    model may be.
+    gridder='mosaic', a :class:`casa_sara.operators.beams.Mosaic`; `subbands` are the frequencies at which a sky of
+    `nterms` > 1 is solved for, a :class:`casa_sara.operators.subbands.Subbands`, once the data are known. `start` and
+    `width` of a cube's spectral axis are '', a channel number or a quantity; `nchan` is -1 where the data tell it.
+    `usemask`, `mask` and `pbmask` say where the model may be.
     """
 
     shape: tuple[int, int]
@@ -74,6 +75,8 @@ class ImageGrid:
     spectralindex: str = ""
     spectrum: Spectrum | None = None
     mosaic: Any = None
+    nterms: int = 1
+    subbands: Any = None
     onepointing: bool = False
     specmode: str = "mfs"
     nchan: int = -1
@@ -96,6 +99,11 @@ class ImageGrid:
     def is_mosaic(self) -> bool:
         """Whether the model is the sky, seen through the primary beam of each pointing."""
         return self.gridder == "mosaic"
+
+    @property
+    def needs_frequencies(self) -> bool:
+        """Whether the samples keep their frequencies."""
+        return bool(self.spectralindex) or self.is_mosaic or self.nterms > 1
 
     @property
     def masked(self) -> bool:
@@ -186,6 +194,18 @@ class Limits:
 
 
 @dataclass(frozen=True)
+class SingleDish:
+    """Total power: names of a single-dish `image` and of its beam (`psf`), and a factor (`gain`) on its brightness.
+
+    Without an image there is none; without a psf the beam is the one in the header of the image.
+    """
+
+    image: str = ""
+    psf: str = ""
+    gain: float = 1.0
+
+
+@dataclass(frozen=True)
 class ImagingRequest:
     """What a run of tsara is asked for."""
 
@@ -195,6 +215,7 @@ class ImagingRequest:
     options: SolverOptions
     output: Output
     limits: Limits = Limits()
+    single_dish: SingleDish = SingleDish()
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Spectral cubes: tclean's axis and dirty cube, lines recovered, channels kept through a stop, and what is refused."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from casa_sara.casa.images.spectral_axis import (
     spectral_axis,
 )
 from casa_sara.casa.ms.read import read_visibilities
-from casa_sara.imaging import cube
+from casa_sara.imaging import cube_planes
 from casa_sara.imaging.time_forecast import STARTING, Timing
 from casa_sara.options import ImageGrid, Selection
 from casa_sara.solver.record import CONVERGED, TIME_LIMIT
@@ -184,7 +183,7 @@ def test_line_is_recovered(solved):
 @pytest.mark.parametrize("asked", [1, 140])
 def test_stopped_cube_goes_on_to_the_same_images(line, solved, monkeypatch, asked):
     """Stopped in the fit that comes first (at most 80 steps), or in the iterations of the second channel."""
-    solve, calls = cube.solve_image, []
+    solve, calls = cube_planes.solve_image, []
 
     class Deadline:
         def __init__(self, last):
@@ -195,13 +194,13 @@ def test_stopped_cube_goes_on_to_the_same_images(line, solved, monkeypatch, aske
             return self.asked > self.last
 
     def stopping(*args):
-        *others, watch = args
+        *others, watch, support = args
         calls.append(1)
-        return solve(*others, replace(watch, deadline=Deadline(asked if len(calls) == 2 else 10**9)))
+        return solve(*others, replace(watch, deadline=Deadline(asked if len(calls) == 2 else 10**9)), support)
 
     options = dict(vis=line, imagename="run", width=1, start=1, nchan=4, **GRID, **FAST)
     with monkeypatch.context() as patch:
-        patch.setattr(cube, "solve_image", stopping)
+        patch.setattr(cube_planes, "solve_image", stopping)
         result = tsara(**options)
     assert len(calls) == 2 and result["stopcode"] == TIME_LIMIT
     codes = {k: one[0]["stopCode"] for k, one in result["summaryminor"][0].items()}
@@ -210,8 +209,8 @@ def test_stopped_cube_goes_on_to_the_same_images(line, solved, monkeypatch, aske
     assert flux[0] > 0 and flux[3] == 0
     assert image("run.residual")[0][:, :, 3].any()  # dirty
     goes_on = []
-    monkeypatch.setattr(cube, "solve_image",
-                        lambda *args: goes_on.append(args[-1].checkpoint.state is not None) or solve(*args))
+    monkeypatch.setattr(cube_planes, "solve_image",
+                        lambda *args: goes_on.append(args[-2].checkpoint.state is not None) or solve(*args))
     again = tsara(restart=True, **options)
     assert goes_on == [asked > 100, False]
     for product in ("model", "residual", "image", "psf"):
@@ -263,8 +262,6 @@ def test_dry_run_counts_the_channels(line):
     (dict(perchanweightdensity=False), "perchanweightdensity = False"),
     (dict(reffreq="1.42GHz"), "reffreq = '1.42GHz' has no effect with specmode = 'cube'"),
     (dict(specmode="mfs", nchan=3), "nchan = 3 has no effect with specmode = 'mfs'"),
-    (dict(savemodel="modelcolumn"), "savemodel = 'modelcolumn' with specmode = 'cube'"),
-    (dict(report=True), "report = True with specmode = 'cube'"),
     (dict(weighting="briggs", npixels=4), "npixels = 4 with specmode = 'cube'"),
     (dict(databound="fixed", l2bound=[1.0, 1.1, 1.2, 1.3]), r"channel 0, .*l2bound = .*there are 1 blocks"),
 ])  # fmt: skip
@@ -275,11 +272,3 @@ def test_refusals(line, options, words):
 
 def test_channel_numbers_may_be_text():
     assert [channel_number(value, "start") for value in ("", 3, "3", "-2", "1.4GHz")] == ["", 3, 3, -2, "1.4GHz"]
-
-
-def test_comparison_refuses_a_cube(solved):
-    from casa_sara import saracompare
-
-    shutil.copytree(solved[0] + ".model", "cube.model")
-    with pytest.raises(ValueError, match=r"models = 'cube.model' has the shape \[64, 60, 1, 4\]"):
-        saracompare(models=["cube", "cube"], outdir="out")

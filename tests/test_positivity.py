@@ -8,6 +8,7 @@ from scipy.optimize import lsq_linear
 
 from casa_sara.operators.measurement import MeasurementOperator
 from casa_sara.parallel.serial import SERIAL
+from casa_sara.solver.planes import Planes
 from casa_sara.solver.positivity import Release
 
 SHAPE = (24, 20)
@@ -29,7 +30,7 @@ def _case(offset, flux=1.0, seed=0):
     model = lsq_linear(matrix, data, (0, np.inf)).x.reshape(SHAPE)
     model[model < 1e-6] = 0  # an interior-point solution only comes near its bounds
     scaled = MeasurementOperator(uv, 1.0, SHAPE, np.full(SAMPLES, 1 / NOISE), dtype=np.float64, eps=1e-10)
-    ppd = SimpleNamespace(sky_over_image=None, measurement=scaled, precond=np.ones(SAMPLES), vis=vis,
+    ppd = SimpleNamespace(sky_over_image=None, planes=Planes(), measurement=scaled, precond=np.ones(SAMPLES), vis=vis,
                           offsets=np.array([0, 600, SAMPLES]), model=model, lowest=np.zeros(SHAPE),
                           adjoint=scaled.adjoint, comm=SERIAL,
                           scratch_image=np.empty(SHAPE), scratch_vis=np.empty(SAMPLES, complex))

@@ -34,6 +34,8 @@ EXCEPTIONS = {
     ("niter", "default"): "an upper limit: the data decide when to stop",
     ("niter", "range"): SURER,
     ("npixels", "range"): SURER,
+    ("nterms", "default"): "1 is the image of flat spectra; tclean has the default of one of its deconvolvers",
+    ("nterms", "openers"): "of all continuum images, as there is one way to solve for them",
     ("outframe", "allowed"): SURER,
     ("pblimit", "range"): SURER,
     ("perchanweightdensity", "allowed"): NARROWER,
@@ -303,7 +305,7 @@ def test_unknown_parameter_is_refused(received):
 def closing_and_opening(parameter):
     """Return the values of the parameter's opener that close it, and those that open it."""
     opener = BY_NAME[parameter.opener]
-    values = opener.allowed or ((True, False) if opener.types == ("bool",) else (0, 1))
+    values = opener.allowed or {("bool",): (True, False), ("string",): ("", "name")}.get(opener.types, (0, 1))
     if parameter.open_on:
         return [value for value in values if value not in parameter.open_on], list(parameter.open_on)
     return list(parameter.open_unless), [value for value in values if value not in parameter.open_unless]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,14 +12,16 @@ import numpy as np
 from PIL import Image
 
 from casa_sara.analysis import animation, convergence, diagnostics, error_pages, pages
+from casa_sara.analysis.columns import Table
 from casa_sara.analysis.comparison import Comparison
+from casa_sara.analysis.cube_comparison import CubeComparison
 from casa_sara.analysis.folder import MEASURES, PAGE, replaced
 from casa_sara.analysis.sheets import DPI
 from casa_sara.analysis.tables import tables
 from casa_sara.analysis.zooms import find_zooms
 from casa_sara.runtime import jsonfile
 
-__all__ = ["Picture", "write_report"]
+__all__ = ["Picture", "page", "write_report"]
 
 TEMPLATE = "report.html.j2"
 ERRORS = (
@@ -83,12 +86,31 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
         jsonfile.save(new / MEASURES, comparison.measures)
         pictures = [*_sky(comparison, new), *_errors(comparison, new), *_frames(comparison, new),
                     *_residuals(comparison, new), *_runs(comparison, new)]
-        (new / PAGE).write_text(_page(comparison, title, pictures), encoding="utf-8")
+        shown = page(comparison, title, pictures, tables(comparison))
+        (new / PAGE).write_text(shown, encoding="utf-8")
     return folder / PAGE
 
 
-def _page(comparison, title, pictures) -> str:
-    """Return the page."""
+def page(comparison: Comparison | CubeComparison, title: str, pictures: Sequence[Picture],
+         measured: Sequence[Table]) -> str:
+    """Return the page of a report.
+
+    Parameters
+    ----------
+    comparison : Comparison or CubeComparison
+        What it is about.
+    title : str
+        Its heading.
+    pictures : sequence of Picture
+        Its pictures.
+    measured : sequence of Table
+        Its tables.
+
+    Returns
+    -------
+    str
+        HTML.
+    """
     loader = jinja2.FileSystemLoader(Path(__file__).parent)
     template = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True,
                                   lstrip_blocks=True).get_template(TEMPLATE)
@@ -96,11 +118,12 @@ def _page(comparison, title, pictures) -> str:
         title=title,
         comparison=comparison,
         shape=comparison.products[0].model.shape,
-        tables=tables(comparison),
+        tables=measured,
         pictures=pictures,
         parameters=_parameters(comparison),
         is_single=len(comparison.products) == 1,
         has_residuals=any(product.residual for product in comparison.products),
+        axis=comparison.axis_words if isinstance(comparison, CubeComparison) else "",
         negative=_negative(comparison),
     )  # fmt: skip
 

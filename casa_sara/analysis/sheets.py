@@ -16,12 +16,13 @@ from astropy.wcs import WCS
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import LogNorm, Normalize
+from matplotlib.colors import AsinhNorm, LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse, Rectangle
 from matplotlib.transforms import Affine2D
 
 from casa_sara.analysis.comparison import Comparison
+from casa_sara.analysis.cube_comparison import CubeComparison
 
 __all__ = ["BRIGHTNESS_MAP", "DIFFERENCE_MAP", "DPI", "LINES", "Sheet", "beam_area", "celestial", "draw", "draw_beam",
            "line", "outline", "plain", "prefix"]
@@ -101,12 +102,12 @@ def beam_area(beam: tuple[float, float, float]) -> float:
     return np.pi * beam[0] * beam[1] / (4 * np.log(2))
 
 
-def celestial(comparison: Comparison) -> WCS:
+def celestial(comparison: Comparison | CubeComparison) -> WCS:
     """Return the coordinates of the grid of a comparison (SIN projection, ICRS).
 
     Parameters
     ----------
-    comparison : casa_sara.analysis.comparison.Comparison
+    comparison : Comparison or CubeComparison
         The products and what was measured.
 
     Returns
@@ -227,7 +228,9 @@ class Sheet:
         bar = self.figure.colorbar(ScalarMappable(norm, colours), cax=axes, orientation="horizontal")
         bar.set_label(unit, **TEXT)
         axes.tick_params(labelsize=8.5)
-        if not isinstance(norm, LogNorm):
+        if isinstance(norm, AsinhNorm):
+            axes.xaxis.set_major_formatter("{x:g}")
+        elif not isinstance(norm, LogNorm):
             axes.locator_params(axis="x", nbins=5)
 
     def save(self, path: str | Path) -> None:

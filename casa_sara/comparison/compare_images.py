@@ -24,7 +24,7 @@ from casa_sara.options import Comparing, Selection
 from casa_sara.reconstruction.draws import read_draws
 from casa_sara.version import __version__
 
-__all__ = ["compare_images"]
+__all__ = ["check_frame", "compare_images", "frame_of", "other_data", "product_of", "read_products", "versions"]
 
 INJECTED = 100.0  # flux of an injected source, in units of the noise per beam with natural weights
 LOST = 1e-4  # fraction of the flux beyond the common grid that is worth a note
@@ -58,33 +58,30 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     ValueError, FileNotFoundError
         The products cannot be compared; the message names the task parameter.
     """
-    sets = _read(request, selection is None, 1 if single or request.features or request.inject else 2)
+    fewest = 1 if single or request.features or request.inject else 2
+    sets = read_products(request, fewest, with_residual=selection is None)
     first, notes = sets[0].model, []
-    if first.plane.frame not in RADESYS:
-        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or "
-                         "B1950")
-    if RADESYS[first.plane.frame] == "FK4":
-        notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
+    check_frame(first, notes)
     frames = read_frames(request.frames, first.plane.upright())
     # one grid
     observed = Observed(selection, first.plane.upright(), request, sets, notes) if selection else None
     plane = observed.plane if observed else _common_plane(sets, notes)
     models = {one.name: _on_grid(one.model, plane, first, "models", notes) for one in sets}
     truth = _truth(request, plane, first, notes)
-    frame = _frame(plane)
+    frame = frame_of(plane)
     regions = region_masks(request.regions, frame)
     injected = _places_to_inject(request, frame, sets, observed)
     features, of_features = _features(request, sets, observed), region_masks(request.features, frame, "features")
     repeat = partial(test_features, selection=selection, nthreads=request.nthreads)
     # one operator
     if observed:
-        notes.extend(_other_data(sets, selection))
+        notes.extend(other_data(sets, selection))
         beams, residuals, chi_square = observed.measured(sets, models)
     else:
         check_same_data(sets)
         beams, residuals, chi_square = *_beside(sets, plane, notes), {}
     # measure
-    products = tuple(_product(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
+    products = tuple(product_of(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
     products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec),
                              features=_tested(one, features.get(one.name), of_features, plane, repeat))
                      for product, one in zip(products, sets))
@@ -94,9 +91,22 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         _inject(injected, plane, request, selection, sets, beams, measures["products"])
     for note in notes:
         log.warn(note)
-    versions = {"casa_sara": __version__} | {name: version(name) for name in VERSIONS}
-    return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures, versions,
-                      tuple(notes), frames)
+    return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures,
+                      versions(), tuple(notes), frames)
+
+
+def versions():
+    """Return the versions of the packages that measures depend on."""
+    return {"casa_sara": __version__} | {name: version(name) for name in VERSIONS}
+
+
+def check_frame(first, notes):
+    """Raise unless the first product is in a frame that pictures can have; add a note where it is none of today."""
+    if first.plane.frame not in RADESYS:
+        raise ValueError(f"models: '{first.name}' is in {first.plane.frame}: the first should be in J2000, ICRS or "
+                         "B1950")
+    if RADESYS[first.plane.frame] == "FK4":
+        notes.append(f"'{first.name}' is in {first.plane.frame}: so are the coordinates in the pictures")
 
 
 def _common_plane(sets, notes):
@@ -113,7 +123,7 @@ def _truth(request, plane, first, notes):
     return _on_grid(read_sky_image(request.truth, "truth", ("Jy/pixel",)), plane, first, "truth", notes)
 
 
-def _frame(plane):
+def frame_of(plane):
     """Return the coordinates of the common grid."""
     centre_deg = tuple(np.degrees(plane.centre).tolist())
     cell_arcsec = tuple((np.array(plane.cell_rad) / ARCSEC).tolist())
@@ -129,8 +139,8 @@ def _places_to_inject(request, frame, sets, observed):
     return injected
 
 
-def _read(request, with_residual, fewest):
-    """Read the products and give them different names."""
+def read_products(request, fewest, **options):
+    """Read the products (`options` as of :func:`read_image_set`) and give them different names."""
     models, names = request.models, request.names
     if len(models) < fewest:
         raise ValueError(f"models = {list(models)}: should be {fewest} or more products to compare")
@@ -138,7 +148,7 @@ def _read(request, with_residual, fewest):
         raise ValueError(f"names = {list(names)}: {len(names)} for {len(models)} models; should be one each, or none")
     if len(set(names)) < len(names) or any("|" in name or not name.strip() for name in names):
         raise ValueError(f"names = {list(names)}: should differ, not be empty, and hold no '|'")
-    sets = [read_image_set(given, name, with_residual) for given, name in zip(models, names or [""] * len(models))]
+    sets = [read_image_set(given, name, **options) for given, name in zip(models, names or [""] * len(models))]
     _refuse_mosaics(models, sets)
     taken = set()
     for number, one in enumerate(sets):
@@ -178,7 +188,7 @@ def _on_grid(image, plane, first, parameter, notes):
     return model
 
 
-def _other_data(sets, selection):
+def other_data(sets, selection):
     """Say which products were not made of just these visibilities."""
     given = data_names(selection.vis)
     for one in sets:
@@ -189,7 +199,7 @@ def _other_data(sets, selection):
             yield f"{len(one.record['wild'])} outliers that '{one.name}' left out are included in the residuals of all"
 
 
-def _product(one, model, residuals, beams, cell_arcsec):
+def product_of(one, model, residuals, beams, cell_arcsec):
     """Return a product with its restored images, model ∗ beam + residual."""
     restored = {}
     for weighting, residual in residuals.items():
@@ -205,7 +215,7 @@ def _features(request, sets, observed):
     if request.features and not again:
         raise ValueError(f"features = {list(request.features)}: needs vis, and images of tsara with their history "
                          "among models; images of other imagers cannot be made again")
-    return {one.name: region_masks(request.features, _frame(one.model.plane.upright()), "features") for one in again}
+    return {one.name: region_masks(request.features, frame_of(one.model.plane.upright()), "features") for one in again}
 
 
 def _tested(one, features, masks, plane, repeat):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from casa_sara.casa.images.image_files import read_spectra
 from casa_sara.casa.images.image_plane import define_image_plane
 from casa_sara.casa.images.restore import fit_beam
 from casa_sara.casa.images.sky_image import SkyPlane, beam_numbers
@@ -18,11 +19,12 @@ from casa_sara.data.blocks import snapshot_blocks
 from casa_sara.imaging.mosaic import check_pointings
 from casa_sara.imaging.plane_images import IMAGE_EPS
 from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.subbands import Subbands
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, Weighting
 from casa_sara.reconstruction.compile_cache import kernels_loading
 
-__all__ = ["Observed"]
+__all__ = ["Observed", "common_gridder"]
 
 SMALLEST_W_PHASE = 0.01  # rad, in the corners of the image, that is worth the w-term
 
@@ -42,9 +44,10 @@ class Observed:
         longitude, latitude = (float(angle) for angle in plane.centre)
         grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
         with kernels_loading(log.info):
-            data = read_visibilities(selection, grid.phasecenter, frequencies=any(map(spectral_index_of, sets)))
+            data = read_visibilities(selection, grid.phasecenter,
+                                     frequencies=any(spectral_index_of(one) or one.spectra for one in sets))
         notes.extend(data.notes + check_pointings(data, replace(grid, onepointing=True)))
-        self._gridder = _common_gridder(sets, data.max_w, plane, notes)
+        self._gridder = common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)
         notes.extend(image_plane.notes)
         self.plane, self._data, self._nthreads = SkyPlane(image_plane.csys, plane.shape), data, request.nthreads
@@ -83,10 +86,24 @@ class Observed:
         They are predicted from its own pixels where these have the common centre: regridding would blur it. A model of
         a known spectral index keeps its spectrum.
         """
+        if one.spectra:
+            return self._data.vis - self._of_spectra(one)
         image = one.model
         plane, pixels = (image.plane, image.pixels) if image.plane.is_aligned(self.plane) else (self.plane, model)
         operator = self._operator(plane, f"models: '{image.name}'", spectral_index_of(one), image.plane)
         return self._data.vis - operator.forward(np.asarray(pixels, np.float32))
+
+    def _of_spectra(self, one):
+        """Return the visibilities of a product whose spectra were solved for."""
+        plane = one.model.plane
+        if not plane.is_aligned(self.plane):
+            raise ValueError(f"models: '{one.name}' was imaged with nterms > 1, and its visibilities are predicted "
+                             "from its own pixels: the other models should have its centre")
+        freqs_hz, spectra = read_spectra(one.spectra)
+        subbands = Subbands(freqs_hz, np.full(freqs_hz.size, 1 / freqs_hz.size), freqs_hz[0], self._data.freq_range_hz)
+        grid = ImageGrid(plane.shape, plane.cell_rad, gridder="standard", subbands=subbands)
+        operator = sky_operator(self._data.uvw, grid, self._data.freq_hz, eps=IMAGE_EPS, nthreads=self._nthreads)
+        return operator.forward(subbands.stacked(spectra))
 
     def _operator(self, plane, what, spectralindex="", reference=None):
         key = plane.shape, plane.cell_rad, spectralindex
@@ -102,7 +119,7 @@ class Observed:
         return self._operators[key]
 
 
-def _common_gridder(sets, max_w, plane, notes):
+def common_gridder(sets, max_w, plane, notes):
     """Return the measurement operator for the residuals of all products, with a note about the reason.
 
     That is without the w-term where all were imaged without it, or where it is nothing; else with it.

@@ -156,7 +156,7 @@ class Visibilities:
 
 @dataclass(frozen=True)
 class BlockInfo:
-    """The contents of a data block; `start` and `end` in MJD seconds."""
+    """The contents of a data block; `start` and `end` in MJD seconds, `band_hz` where it holds a part of the band."""
 
     ms_name: str
     observations: tuple[int, ...]
@@ -164,13 +164,16 @@ class BlockInfo:
     start: float
     end: float
     samples: int
+    band_hz: tuple[float, float] | None = None
 
     @property
     def label(self) -> str:
         """The block in one line."""
         first, last = (clock(time) for time in (self.start, self.end))
         observations, scans = (",".join(map(str, numbers)) for numbers in (self.observations, self.scans))
-        return f"{self.ms_name} observation {observations} scan {scans}, {first} to {last}, {self.samples} samples"
+        band = "" if self.band_hz is None else f"{self.band_hz[0] / 1e9:.4g} to {self.band_hz[1] / 1e9:.4g} GHz, "
+        return (f"{self.ms_name} observation {observations} scan {scans}, {first} to {last}, {band}{self.samples} "
+                "samples")
 
 
 def clock(mjd_seconds: float) -> str:

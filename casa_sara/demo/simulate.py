@@ -176,7 +176,11 @@ class _Rows:
         uvw_m = self.table.getcol("UVW")
         inverse_wavelength = observation.channel_freqs_hz / SPEED_OF_LIGHT
         uvw = (uvw_m[:, None, :] * inverse_wavelength[:, None]).reshape(3, -1)
-        self.signal = predict(sky, uvw).reshape(inverse_wavelength.size, -1)
+        if sky.index is None:
+            self.signal = predict(sky, uvw).reshape(inverse_wavelength.size, -1)
+        else:
+            self.signal = np.array([predict(sky.at(freq), uvw_m / (SPEED_OF_LIGHT / freq))
+                                    for freq in observation.channel_freqs_hz])
         self.pointing_rms = observation.pointing_rms
         self.slopes = [] if not self.pointing_rms else [
             predict(tilted, uvw).reshape(self.signal.shape) for tilted in _tilted(sky)]

@@ -7,7 +7,7 @@ image of 512×256 pixels of 0.06 arcsec.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -49,12 +49,22 @@ class Sky:
         Pixels per pixel of the image to be made, along each axis.
     points : float64 (n, 3)
         Point sources: l (east), m (north) in radians, flux in Jy.
+    index : float64 (nx, ny) or None
+        Spectral index of each pixel, where it is not 0; point sources have spectra that are flat.
+    reference_hz : float
+        Frequency at which the sky is `image`, where there is an `index`.
     """
 
     image: np.ndarray
     cell_rad: float
     oversampling: int = 1
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    index: np.ndarray | None = None
+    reference_hz: float = 0.0
+
+    def at(self, freq_hz: float) -> Sky:
+        """Return the sky at one frequency, with flat spectra."""
+        return replace(self, image=self.image * (freq_hz / self.reference_hz) ** self.index, index=None)
 
     def truth(self) -> np.ndarray:
         """Return what an image at the coarse cell should show, float64 (nx/k, ny/k) in Jy/pixel.

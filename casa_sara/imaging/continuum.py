@@ -12,6 +12,7 @@ from casa_sara.casa.images.image_files import read_model
 from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, read_pixels
 from casa_sara.casa.images.masks import read_support
 from casa_sara.casa.images.products import write_images, write_products
+from casa_sara.casa.images.restore import restored_beam
 from casa_sara.casa.images.spectral_index import with_spectrum
 from casa_sara.casa.ms.block_selection import divide
 from casa_sara.casa.ms.read import read_visibilities
@@ -45,7 +46,10 @@ from casa_sara.imaging.run_solver import (
     solve_image,
     without_wild,
 )
+from casa_sara.imaging.spectra import divided_by_band, spectral_images, with_subbands
 from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
+from casa_sara.imaging.total_power import total_power
+from casa_sara.operators.subbands import Subbands
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, ImagingRequest
 from casa_sara.parallel.serial import SERIAL, Serial
@@ -53,10 +57,11 @@ from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import operator_accuracy
+from casa_sara.reconstruction.total_power import TotalPower
 from casa_sara.runtime.deadline import Deadline
 
 __all__ = [
-    "Result", "Split", "describe", "make_image", "split",
+    "Result", "Split", "after_iterations", "describe", "make_image", "split",
 ]
 
 MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
@@ -69,8 +74,8 @@ class Result:
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
     from the data, relative to the MS weights; `forecast` is the forecast of memory and time made before; `suspects`
-    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`. With several ranks, each has its own samples in
-    `data`, and `size` is the number of all.
+    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`; `subbands` are those of unknown spectra. With
+    several ranks, each has its own samples in `data`, and `size` is the number of all.
     """
 
     data: Visibilities
@@ -82,6 +87,7 @@ class Result:
     model_flux: float
     forecast: dict
     suspects: list = field(default_factory=list)
+    subbands: Subbands | None = None
 
     @property
     def finished(self) -> bool:
@@ -134,15 +140,17 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
             data, plane = _read(request, ranks)
         if output.images_stand:
             return _complete(request, plane, data, forecast, comm)
-        part = split(data, output.blocks, comm)
+        part = split(data, output.blocks, comm, plane.grid.subbands)
         del data  # the same samples, not yet sorted
         _check(request, plane, part, comm)
         watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
         solution = _solve(request, plane, part, watch, ranks)
-        images = plane_images(solution.part.data, solution.model, plane.grid, request.weighting, request.options,
+        images = plane_images(solution.part.data, solution.seen, plane.grid, request.weighting, request.options,
                               plane.image_plane, comm)
+        images.pixels["model"] = solution.model
         doubtful = _look_back(images, plane, solution, comm)
-        result = solution.result(images, doubtful, replace(forecast, iteration_s=watch.pace.seconds), comm)
+        forecast = replace(forecast, iteration_s=watch.pace.seconds)
+        result = solution.result(images, doubtful, forecast, plane.grid.subbands, comm)
         comm.once(_write, request, plane, images, solution.reconstruction, record and record(result), child)
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
@@ -155,13 +163,15 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
 class _Plane:
     """The plane of the image: `grid` is what was asked for, with the spectrum that belongs to the plane.
 
-    `startmodel` real (nx, ny) in Jy/pixel and `support` bool (nx, ny) are None where there is none.
+    `startmodel` real (nx, ny) in Jy/pixel, `support` bool (nx, ny) and `dish`, what a single dish tells of the sky, are
+    None where there is none.
     """
 
     image_plane: ImagePlane
     grid: ImageGrid
     startmodel: np.ndarray | None
     support: np.ndarray | None = None
+    dish: TotalPower | None = None
 
 
 @dataclass(frozen=True)
@@ -172,17 +182,23 @@ class _Solution:
     part: Split
     reconstruction: Reconstruction | None = None
 
-    def result(self, images, doubtful, forecast, comm):
+    @property
+    def seen(self):
+        """The model, at all frequencies that were solved for where these are several."""
+        spectra = self.reconstruction and self.reconstruction.spectra
+        return self.model if spectra is None else spectra
+
+    def result(self, images, doubtful, forecast, subbands, comm):
         """Return what the task tells of it."""
         data, blocks = self.part.data, self.part.blocks
         return Result(data, comm.total(data.size), blocks, self.part.noise, self.reconstruction, images.residual_peak,
-                      images.model_flux, forecast.summary(), doubtful)
+                      images.model_flux, forecast.summary(), doubtful, subbands)
 
 
 def _read(request, ranks):
     """Return this rank's visibilities, and the plane of the image with its first model and support."""
     grid, output, comm = request.grid, request.output, ranks.comm
-    frequencies = bool(grid.spectralindex) or grid.is_mosaic
+    frequencies = grid.needs_frequencies
     data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks)
     data.notes.extend(check_pointings(data, grid))
     if grid.is_mosaic:
@@ -192,18 +208,19 @@ def _read(request, ranks):
     if grid.is_mosaic:
         weights = imaging_weights(data, grid, request.weighting, comm)
         plane = plane.of_mosaic(weight_image(data, grid, weights), output.pblimit)
+    dish = total_power(request.single_dish, data, plane, grid)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
     _caution(data)
-    grid = comm.once(with_spectrum, grid, plane)
+    grid = comm.once(with_spectrum, with_subbands(grid, data, plane), plane)
     start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
     if output.images_stand:
         return data, _Plane(plane, grid, start)
     support = comm.once(read_support, grid, plane)
     if support is not None and start is not None:
         start *= support
-    return data, _Plane(plane, grid, start, support)
+    return data, _Plane(plane, grid, start, support, dish)
 
 
 def _complete(request, plane, data, forecast, comm):
@@ -230,9 +247,10 @@ def _solve(request, plane, part, watch, ranks):
     options, grid, comm, data = request.options, plane.grid, ranks.comm, part.data
     if options.niter == 0:
         return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
-    watch.deadline.reserve = _after_iterations(comm.total(data.size), grid, request.output, request.limits,
-                                               watch.deadline.elapsed()) + error_seconds(options, grid.shape)
-    samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise)
+    watch.deadline.reserve = after_iterations(comm.total(data.size), grid.shape, request.output, request.limits,
+                                              watch.deadline.elapsed()) + error_seconds(options, grid.shape)
+    samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise,
+                      total_power=plane.dish)
     found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, ranks)
     list_islands(found.record, plane.image_plane, grid.cell_rad, options.significance, comm)
     used, blocks = without_wild(data, part.blocks, part.offsets, found, comm)
@@ -246,7 +264,8 @@ def _look_back(images, plane, solution, comm):
     doubtful = suspects(part.blocks, part.noise, found.l2_bounds) if found else []
     for line in named_suspects(part.blocks, doubtful):
         log.warn(line)
-    _caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
+    if plane.dish is None:
+        _caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
     if plane.support is not None:
         pixels["mask"] = check_confined(pixels["model"], plane.support)
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
@@ -262,10 +281,13 @@ def _write(request, plane, images, reconstruction, record, child):
     errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
     if "model.error" in errors:
         errors["draws"] = draws.arrays()
+    if reconstruction and reconstruction.spectra is not None:
+        beam = restored_beam(list(request.output.restoringbeam or ()), images.beam)
+        errors |= spectral_images(reconstruction, plane.grid, beam)
     write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child)
 
 
-def split(data, blocks, comm=SERIAL):
+def split(data, blocks, comm=SERIAL, subbands=None):
     """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`).
 
     Parameters
@@ -276,12 +298,14 @@ def split(data, blocks, comm=SERIAL):
         As of :class:`casa_sara.options.Output`.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
+    subbands : Subbands, optional
+        Parts of the band that have blocks of their own.
 
     Returns
     -------
     Split
     """
-    block_of_sample, infos = divide(data, blocks, comm)
+    block_of_sample, infos = divided_by_band(*divide(data, blocks, comm), data, subbands)
     data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
     noise = noise_from_differences(data, offsets, comm)
     return Split(data, infos, offsets, noise)
@@ -300,10 +324,10 @@ def _peak(name):
         return float(np.abs(read_pixels(ia)).max())
 
 
-def _after_iterations(samples, grid, output, limits, read_s):
+def after_iterations(samples, shape, output, limits, read_s):
     """Seconds to reserve for the time after the iterations: images, model column, report."""
     column = MODEL_COLUMN * read_s if output.savemodel == "modelcolumn" else 0.0
-    return writing_seconds(samples, grid.shape) + column + (REPORT_SECONDS if limits.report else 0.0)
+    return writing_seconds(samples, shape) + column + (REPORT_SECONDS if limits.report else 0.0)
 
 
 def describe(data, blocks, noise, stokes, comm=SERIAL):

@@ -2,30 +2,61 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+import copy
+import glob
+from contextlib import contextmanager, nullcontext
 
+import numpy as np
+
+from casa_sara.casa.runtime import log
+from casa_sara.parallel.serial import SERIAL
 from casa_sara.reconstruction.result import Reconstruction
+from casa_sara.reconstruction.state_file import CheckpointError, digest
 
 __all__ = ["CubeCheckpoint"]
 
 
 class CubeCheckpoint:
-    """Keeps the solutions of finished channels and the state of the solution in progress in one checkpoint.
+    """Keeps the solutions of finished channels and the state of the solution in progress.
+
+    Each rank has a file of its own, rank 0 that of one process, the others with their numbers behind: a run is
+    continued from all of them, by any number of ranks.
 
     Parameters
     ----------
     checkpoint : casa_sara.reconstruction.checkpoint.Checkpoint
-        Opened, if it is to be resumed from.
+        Of one process.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        The ranks that share the channels.
 
     Attributes
     ----------
+    file : Checkpoint
+        Of this rank.
     finished : dict
         Channel → Reconstruction.
     """
 
-    def __init__(self, checkpoint):
-        self.file, self.finished = checkpoint, {}
-        self._channel, self._solution = -1, None
+    def __init__(self, checkpoint, comm=SERIAL):
+        self._main, self._comm, self._read = checkpoint, comm, []
+        self.file = _numbered(checkpoint, comm.rank) if comm.rank else checkpoint
+        self.finished, self._solutions = {}, {}
+
+    def open(self):
+        """Read the files of all ranks; those beside the first count only where they are of this run.
+
+        Raises
+        ------
+        CheckpointError
+            The first is damaged, or of another version or other parameters.
+        """
+        self._main.open()
+        self._read = [self._main]
+        for number in self._numbers():
+            file = self.file if number == self._comm.rank else _numbered(self._main, number)
+            with _passed_over():
+                file.open()
+                self._read.append(file)
 
     def identify(self, **data):
         """Identify the data of all channels, and restore the solutions that were read for them.
@@ -35,16 +66,37 @@ class CubeCheckpoint:
         CheckpointError
             What was read is not of these data, or not of a cube.
         """
-        self.file.identify(**data)
-        if self.file.state is None:
-            return
-        with self.file.applied() as state:
-            self.finished = {int(channel): _reconstruction(one) for channel, one in state["finished"].items()}
-            self._channel, self._solution = state["channel"], state["solution"]
+        data = {name: digest(np.ascontiguousarray(one)) if one is not None else None for name, one in data.items()}
+        for file in dict.fromkeys([self._main, self.file, *self._read]):
+            with nullcontext() if file is self._main else _passed_over():
+                file.identify(**data)
+                if file.state is not None:
+                    self._restore(file)
+
+    def _restore(self, file):
+        with file.applied() as state:
+            self.finished |= {int(channel): _reconstruction(one) for channel, one in state["finished"].items()}
+            if state["channel"] >= 0:
+                self._solutions[state["channel"]] = state["solution"]
+
+    def clear(self, finished):
+        """Remove the files of a run that is `finished`, and else this rank's where it is of an older one."""
+        if not finished:
+            if not self.file.stands:
+                self.file.remove()
+        elif self._comm.rank == 0:
+            for number in self._numbers():
+                _numbered(self._main, number).remove()
+            self._main.remove()
 
     def of(self, channel):
         """Return what the solution of one channel takes for its checkpoint."""
-        return _OfChannel(self, channel, self._solution if channel == self._channel else None)
+        return _OfChannel(self, channel, self._solutions.pop(channel, None))
+
+    def _numbers(self):
+        """Return the numbers of the files beside the first."""
+        ends = (path.rpartition(".")[2] for path in glob.glob(glob.escape(self._main.path) + ".*"))
+        return sorted(int(end) for end in ends if end.isdigit())
 
     def finish(self, channel, reconstruction):
         """Add a finished channel, and write when it is time."""
@@ -92,6 +144,22 @@ class _OfChannel:
         """Write when it is time, or `now`."""
         self.kept = self.kept or now
         self._cube.keep(self._channel, make_state, iteration, now)
+
+
+@contextmanager
+def _passed_over():
+    """Say in the log that a file beside the first is not of this run, and go on."""
+    try:
+        yield
+    except CheckpointError as error:
+        log.info(f"passed over: {error}")
+
+
+def _numbered(checkpoint, number):
+    """Return the checkpoint of another rank of the same run."""
+    other = copy.copy(checkpoint)
+    other.path, other.state, other.stands = f"{checkpoint.path}.{number}", None, False
+    return other
 
 
 def _reconstruction(state):

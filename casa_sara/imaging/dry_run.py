@@ -20,8 +20,10 @@ from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.imaging.load_balance import assign_ranks
 from casa_sara.imaging.memory_forecast import Workload, forecast
 from casa_sara.imaging.mosaic import check_pointings, with_beams
+from casa_sara.imaging.spectra import divided_by_band, with_subbands
 from casa_sara.imaging.time_forecast import measure
 from casa_sara.operators.measurement import check_field
+from casa_sara.parallel.partition import ALONE
 from casa_sara.parallel.serial import SERIAL
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.runtime.machine import available_memory, resident_memory
@@ -42,7 +44,7 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL):
     casa_sara.parallel.partition.RankAssignment
     """
     resident, available = resident_memory(), (available_memory() - WRITER) // comm.node_size
-    channels, share = _channels(selection, grid)
+    channels, share = comm.once(_channels, selection, grid)
     for flags in (False, True):
         volume = comm.once(measure_volume, selection, flags, grid.stokes)
         if any(volume.reach):  # else there is nothing to read, which reading explains
@@ -53,7 +55,8 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL):
             work = Workload.of(volume, grid, options, limits.report, band, ranks)
             return forecast(replace(work, channels=channels, share=share), resident, available, limits.maxmem_gb)
 
-        ranks = assign_ranks(comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
+        ranks = ALONE if grid.is_cube else assign_ranks(  # each rank has its channels, and reads all
+            comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
         found = memory_of(ranks)
         if all(comm.allgather(found.fits)):
             break
@@ -111,16 +114,19 @@ def dry_run(selection, grid, options, blocks, limits):
             log.warn(str(error))
             return found.summary() | {"reason": str(error)}
     start = time.perf_counter()
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes, bool(grid.spectralindex) or grid.is_mosaic)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, grid.needs_frequencies)
     check_pointings(data, grid)
     if grid.is_mosaic:
         data, grid = with_beams(data, selection, grid)
     if grid.spectralindex:
         grid = with_spectrum(grid, define_image_plane(data, selection, grid))
+    if grid.nterms > 1:
+        grid = with_subbands(grid, data, define_image_plane(data, selection, grid))
     everything = data.size
     if grid.is_cube:
         data = _fullest_channel(data, selection, grid)
-    data, offsets = sort_into_blocks(data, divide(data, blocks)[0])
+    block_of_sample, _ = divided_by_band(*divide(data, blocks), data, grid.subbands)
+    data, offsets = sort_into_blocks(data, block_of_sample)
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
     timing = replace(timing, channels=max(found.workload.channels, 1))
     for line in _time_lines(timing):

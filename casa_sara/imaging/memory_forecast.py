@@ -35,7 +35,10 @@ NORM, NNLS, SOLVING, WRITING = 8, 4, 9, 10
 MATCHED = 13  # of the matched filters, while the support is found
 DRAW, DRAWN_PART = 1.5, 0.3  # of a draw of the bootstrap, and the part of the image where a confined model may be
 ERRORS = 10  # images of errors, and of the smoothing
+MIXED, INDEXED = 2, 8  # of each image where several frequencies are solved for; of their smoothed ones
+CONTRIBUTED = 8  # bytes of a sample, of each of these
 CUBES = 3  # psf, residual and model of each channel
+MASK = 1.25  # of each channel of a cube, as it is used and as it is written
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
 REPORT, REPORT_SAMPLE, REPORT_PLANES = 70_000_000, 60, 44  # of drawing, of one visibility, image planes
@@ -70,6 +73,7 @@ class Workload:
     draws: int = 0  # of bootstrap and jackknife
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
     averages: bool = False  # visibilities may be averaged
+    nterms: int = 1  # images that are solved for together
 
     @classmethod
     def of(cls, volume, grid, options, report=False, band=0.0, ranks=ALONE):
@@ -81,12 +85,12 @@ class Workload:
         return cls(math.ceil(volume.samples * ranks.share), volume.reach, grid.shape, grid.cell_rad,
                    len(ranks.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
                    options.precondition, report and writes, grid.gridder, volume.max_w,
-                   bool(grid.spectralindex) or grid.is_mosaic, band, masked=grid.masked,
+                   grid.needs_frequencies, band, masked=grid.masked,
                    whole=(volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2,
-                   averages=options.averages and not grid.is_mosaic)
+                   averages=options.averages and not grid.is_mosaic, nterms=grid.nterms)
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -98,13 +102,14 @@ class Workload:
         one.pop("reading")
         writing = one.pop("writing")
         held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
-                "cubes": self._planes((PLANE + CUBES) * self.channels)}
+                "cubes": self._planes((PLANE + CUBES + MASK * self.masked) * self.channels)}
         reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples,
                    "while reading": READING * self.samples}
         return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
                 "images of a channel": writing | held,
                 "writing": {"libraries": LIBRARIES, **held,
-                            "process that writes": self._planes((PLANE + CUBES + 1) * self.channels)}}
+                            "process that writes": self._planes((PLANE + CUBES + MASK * self.masked + 1)
+                                                                * self.channels)}}
 
     def _of_plane(self):
         """The phases of one plane, in their order."""
@@ -127,16 +132,16 @@ class Workload:
         coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
         with_solver = with_operator | self._solver()
         iterating = with_solver | {
-            "image planes": self._planes(PLANE + SOLVING + MATCHED * self.confined),
+            "image planes": self._planes(PLANE + SOLVING * self.nterms + MATCHED * self.confined + self._mixing()),
             "re-weighting": (RENEWING if self.averages else PASSING) * self.samples,
-            "wavelet duals and weights": self.duals * coefs,
+            "wavelet duals and weights": self.duals * self.nterms * coefs,
             "wavelet workspace": workspace}
         phases = {}
         if self.precondition:
             cells = DENSITY_CELL * self._side() ** 2
             phases["density of samples"] = held | {"uv grid": WEIGHING * self.samples + cells}
         phases["building the operator"] = with_operator | {"while planning": PLANNING * self.samples}
-        phases["NNLS"] = with_solver | {"image planes": self._planes(PLANE + max(NORM, NNLS))}
+        phases["NNLS"] = with_solver | {"image planes": self._planes(PLANE + max(NORM, NNLS) * self.nterms)}
         phases["iterating"] = iterating
         if self.draws:
             phases["drawing"] = iterating | {"draws": self._drawn() + self._planes(2)}
@@ -153,11 +158,11 @@ class Workload:
             return {"solver's visibilities": SOLVER * self.samples}
         most = math.ceil(WORTHWHILE * self.samples)
         return {"solver's visibilities": AVERAGED * self.samples + AVERAGE * most + self._grid()
-                + further_bytes(most, self, self.max_w, self.band)}
+                + further_bytes(most, self, self.max_w, self.band) + self._spectra(most)}
 
     def _writing(self, with_operator):
-        parts = with_operator | {"while planning": PLANNING * self.samples,
-                                 "image planes": self._planes(PLANE + WRITING + ERRORS * bool(self.draws))}
+        planes = PLANE + WRITING + ERRORS * bool(self.draws) + self._smoothing()
+        parts = with_operator | {"while planning": PLANNING * self.samples, "image planes": self._planes(planes)}
         if self.draws:
             parts |= {"draws": self._drawn()}
         return parts | {"operator of flat spectra": self._operator()} if self.frequencies else parts
@@ -171,10 +176,23 @@ class Workload:
 
     def _operator(self, band=0.0):
         """Bytes of the measurement operator; `band` of an image of spectral indices, 0 for flat spectra."""
-        return POINT * self.samples + self._grid() + further_bytes(self.samples, self, self.max_w, band)
+        further = further_bytes(self.samples, self, self.max_w, band) + self._spectra(self.samples)
+        return POINT * self.samples + self._grid() + further
 
     def _planes(self, count):
         return int(4 * (count + SUPPORT * self.masked) * math.prod(self.shape))
+
+    def _mixing(self):
+        """Image planes in which images of several frequencies become orders of the spectra."""
+        return MIXED * self.nterms * (self.nterms > 1)
+
+    def _smoothing(self):
+        """Image planes of the spectral index."""
+        return INDEXED * self.nterms * (self.nterms > 1)
+
+    def _spectra(self, samples):
+        """Bytes of the factors of samples on images of several frequencies, and of what one of these contributes."""
+        return (CONTRIBUTED + 4 * self.nterms) * samples * (self.nterms > 1)
 
     def _drawn(self):
         """Bytes of the draws."""

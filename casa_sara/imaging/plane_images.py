@@ -49,7 +49,7 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     data : Visibilities
         The samples.
     model : real (nx, ny)
-        Jy/pixel.
+        Jy/pixel; (T, nx, ny) at the frequencies of `grid.subbands`, where there are some and the model differs there.
     grid : ImageGrid
         Size, pixels, direction and gridder of the image.
     weighting : Weighting
@@ -68,7 +68,8 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     weights, operator, psf, beam = point_spread(data, grid, weighting, options, plane, comm)
     if grid.is_mosaic:
         operator = _operator(data, grid, options, comm)
-    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, model, comm), weights, comm)
+    seen = model if grid.subbands is None else grid.subbands.stacked(model)
+    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, seen, comm), weights, comm)
     pixels = dict(psf=psf, residual=residual, model=model)
     if grid.is_mosaic:
         pixels["weight"] = weight_image(data, grid, weights)
@@ -81,8 +82,8 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
 
 
 def _predicted(operator, data, grid, options, model, comm):
-    """Return the visibilities of a model, by the operator of the dirty images unless there is a spectrum."""
-    if grid.spectrum is not None:
+    """Return the visibilities of a model, by the operator of the dirty images unless there are spectra."""
+    if grid.spectrum is not None or grid.subbands is not None:
         operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm,
                                 beam=data.beam)
     return operator.forward(model)

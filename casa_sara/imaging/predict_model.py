@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import asdict
+from functools import partial
 
+import numpy as np
+
+from casa_sara.casa.images.spectral_axis import SpectralAxis
 from casa_sara.casa.ms.model_column import save_model_column, write_model_column
 from casa_sara.casa.runtime import log
 from casa_sara.imaging.mosaic import MosaicModel, beams_record
@@ -14,25 +18,44 @@ from casa_sara.options import ImageGrid, Selection, Spectrum
 __all__ = ["save_model", "write_column"]
 
 
-def save_model(selection, data, grid, options, model):
-    """Write the model's visibilities into the MeasurementSets: the last phase, after the images are complete."""
+def save_model(selection, data, grid, options, model, axis=None):
+    """Write the model's visibilities into the MeasurementSets: the last phase, after the images are complete.
+
+    The model (nchan, nx, ny) of a cube comes with its spectral axis.
+    """
     log.info("writing MODEL_DATA")
     save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
                       cell_rad=grid.cell_rad, gridder=grid.gridder, spectrum=grid.spectrum and asdict(grid.spectrum),
                       nthreads=options.nthreads, model=model,
-                      beams=beams_record(data, grid) if grid.is_mosaic else None)
+                      beams=beams_record(data, grid) if grid.is_mosaic else None, axis=axis and vars(axis))
 
 
 def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads, model,  # noqa: PLR0913 - of a message
-                 beams=None):
+                 beams=None, axis=None):
     """Predict the visibilities of a model and write them: what `save_model_column` has a child process do."""
     chosen = Selection(**{name: tuple(value) if isinstance(value, list) else value
                           for name, value in selection.items()})
-    grid = ImageGrid(model.shape, tuple(cell_rad), gridder=gridder, spectrum=spectrum and Spectrum(**spectrum))
+    grid = ImageGrid(model.shape[-2:], tuple(cell_rad), gridder=gridder, spectrum=spectrum and Spectrum(**spectrum))
     accuracy = dict(eps=IMAGE_EPS, nthreads=nthreads)
     if beams is not None:
         predict = MosaicModel(model, grid, chosen, phase_center, beams, accuracy)
         write_model_column(chosen, phase_center, predict, by_row=True)
         return
-    write_model_column(chosen, phase_center,
-                       lambda uvw, freq_hz: sky_operator(uvw, grid, freq_hz, **accuracy).forward(model))
+    plane = partial(_predicted, grid=grid, accuracy=accuracy)
+    predict = partial(plane, model=model) if axis is None else partial(_of_channels, model, SpectralAxis(**axis), plane)
+    write_model_column(chosen, phase_center, predict)
+
+
+def _predicted(uvw, freq_hz, model, grid, accuracy):
+    """Return the visibilities of one plane."""
+    return sky_operator(uvw, grid, freq_hz, **accuracy).forward(model)
+
+
+def _of_channels(models, axis, plane, uvw, freq_hz):
+    """Return the visibilities of a cube: each of the channel that holds its frequency, 0 where none does."""
+    channel, vis = axis.nearest(freq_hz), np.zeros(freq_hz.size, np.complex64)
+    for k in np.unique(channel[channel >= 0]):
+        if models[k].any():
+            here = channel == k
+            vis[here] = plane(uvw[:, here], freq_hz[here], model=models[k])
+    return vis

@@ -10,6 +10,7 @@ import numpy as np
 
 from casa_sara.data.noise import noise_from_differences
 from casa_sara.operators.dictionary import SaraDictionary
+from casa_sara.operators.subbands import SubbandDictionary
 from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, DRAW_REWEIGHTINGS, MOST_GROUPS
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
 from casa_sara.reconstruction.problem import Problem, Samples
@@ -108,11 +109,14 @@ def measure(data, offsets, grid, options, reading):
     samples = Samples(data, offsets, np.ones(data.size, np.float32))
     problem = Problem.of(samples, grid, options, unit_jy=1.0, eps=eps, data_norm_sq=bound)
     building = time.perf_counter() - start
-    image, measurement = np.ones(grid.shape, np.float32), problem.measurement
+    measurement = problem.measurement
+    image = np.ones(measurement.shape, np.float32)
     pair = _seconds(lambda: measurement.adjoint(measurement.forward(image)))
     # two iterations, and one Φ of the last image
     first = _seconds(lambda: nnls(measurement, problem.vis, problem.precond, bound, NNLSFit(max_iter=2))) / 2.5
     dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
+    if grid.subbands is not None:
+        dictionary = SubbandDictionary(dictionary, grid.subbands.orders)
     if options.method == PAPER:
         dictionary = paper_prior(dictionary, measurement)
     ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond, bound, options.positivity)

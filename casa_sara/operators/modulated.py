@@ -77,7 +77,7 @@ class ModulatedOperator:
             run(_advance, order, self._place, self._polynomial, self._previous)
             run(_multiply, self._polynomial, image, self._image)
             self._base.forward(self._image, self._vis)
-            run(_add_term, order, turn, factor, self._vis, out)
+            run(add_term, order, turn, factor, self._vis, out)
         run(_rotate, self._rotation, out)
         return out
 
@@ -98,7 +98,7 @@ class ModulatedOperator:
         vis, out = for_adjoint(self, vis, out)
         run = self.workers.run
         for order, (turn, factor) in enumerate(zip(self._turns, self._factors)):
-            run(_take_term, np.conj(turn), factor, self._rotation, vis, self._vis)
+            run(take_term, np.conj(turn), factor, self._rotation, vis, self._vis)
             self._base.adjoint(self._vis, self._image)
             run(_advance, order, self._place, self._polynomial, self._previous)
             run(_add_product, order, self._polynomial, self._image, out)
@@ -213,16 +213,48 @@ def _add_product(order, polynomial, image, out, worker, workers):
 
 
 @_jit
-def _add_term(order, turn, factor, vis, out, worker, workers):
-    """out += t^k B_k·vis, or = for the first."""
+def add_term(order, turn, factor, vis, out, worker, workers):
+    """out += t^k B_k·vis, or = for the first.
+
+    Parameters
+    ----------
+    order : int
+        k.
+    turn : complex
+        t^k.
+    factor : real (M,)
+        B_k.
+    vis : complex (M,)
+        One transform.
+    out : complex (M,)
+        The sum so far.
+    worker, workers : int
+        Number of this thread, and of all.
+    """
     for m in range(vis.size * worker // workers, vis.size * (worker + 1) // workers):
         term = turn * (factor[m] * vis[m])
         out[m] = term if order == 0 else out[m] + term
 
 
 @_jit
-def _take_term(turn, factor, rotation, vis, out, worker, workers):
-    """Adjoint of `_add_term` and `_rotate`; `turn` is the conjugate already."""
+def take_term(turn, factor, rotation, vis, out, worker, workers):
+    """Adjoint of `add_term` and `_rotate`.
+
+    Parameters
+    ----------
+    turn : complex
+        The conjugate of t^k.
+    factor : real (M,)
+        B_k.
+    rotation : complex (M,) or (0,)
+        r; of no samples for ones.
+    vis : complex (M,)
+        The visibilities.
+    out : complex (M,)
+        Receives what one transform takes of them.
+    worker, workers : int
+        Number of this thread, and of all.
+    """
     for m in range(vis.size * worker // workers, vis.size * (worker + 1) // workers):
         value = turn * (factor[m] * vis[m])
         out[m] = value * np.conj(rotation[m]) if rotation.size else value

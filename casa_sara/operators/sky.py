@@ -19,6 +19,7 @@ import numpy.typing as npt
 from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, NoVisibilities, share_of
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
 from casa_sara.operators.mosaic import MosaicOperator
+from casa_sara.operators.subbands import SubbandOperator
 from casa_sara.operators.widefield import WGridder, WTerm, w_operator
 from casa_sara.options import LARGEST_INDEX, ImageGrid
 from casa_sara.parallel.serial import SERIAL, Serial
@@ -35,7 +36,8 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
                  freq_hz: np.ndarray | None = None, row_scale: np.ndarray | None = None, eps: float = 1e-6,
                  dtype: npt.DTypeLike = np.float32,
                  nthreads: int = 1, comm: Serial = SERIAL, beam: np.ndarray | None = None,
-                 ) -> MeasurementOperator | ModulatedOperator | MosaicOperator | WGridder | NoVisibilities:
+                 ) -> (MeasurementOperator | ModulatedOperator | MosaicOperator | SubbandOperator | WGridder
+                       | NoVisibilities):
     """Return the measurement operator of an image.
 
     Parameters
@@ -43,7 +45,7 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
     uvw : float64 (3, M)
         Baselines in wavelengths.
     grid : casa_sara.options.ImageGrid
-        `shape`, `cell_rad`, `gridder`, `mosaic` and `spectrum` decide.
+        `shape`, `cell_rad`, `gridder`, `mosaic`, `spectrum` and `subbands` decide.
     freq_hz : real (M,), optional
         Frequencies; without them the sky is as bright at all frequencies as at the reference.
     row_scale, eps, dtype, nthreads
@@ -55,13 +57,15 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
 
     Returns
     -------
-    MeasurementOperator, ModulatedOperator, MosaicOperator, WGridder or NoVisibilities
+    MeasurementOperator, ModulatedOperator, MosaicOperator, SubbandOperator, WGridder or NoVisibilities
     """
     def of_place(row_scale, eps):
         if grid.mosaic is not None:
             return MosaicOperator(uvw, np.asarray(beam), grid.mosaic, row_scale, eps, dtype, nthreads)
         return _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm)
 
+    if grid.subbands is not None and freq_hz is not None:
+        return SubbandOperator(of_place(row_scale, eps), grid.subbands.factors(freq_hz))
     spectrum = grid.spectrum if freq_hz is not None else None
     if spectrum is None:
         return of_place(row_scale, eps)

@@ -22,6 +22,7 @@ LAUNCHED = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK")  # set by mpirun an
 SPIN, NAP = 0.001, 1e-4  # s of waiting at full speed; s of each pause after that
 GRACE = 10.0  # s that the other ranks have to end by themselves after an error
 PIECE = 1 << 28  # bytes of one message
+ERROR, STOP = 0, 1  # tags of what ranks say unasked
 FEW = 1 << 20  # values that every rank can be given
 SHARED_MEMORY = "/dev/shm"
 
@@ -47,6 +48,7 @@ class MPI(Serial):
         self.node_size = self._node.Get_size()
         self.part, self._windows = (0, 1), []
         self._sent, self._raised, self._stuck = [], None, False
+        self._stops, self._told, self._stop_code = [], 0, 0
 
     def allreduce(self, array: np.ndarray) -> np.ndarray:
         self._meet()
@@ -209,6 +211,28 @@ class MPI(Serial):
     def own(self, image: np.ndarray) -> np.ndarray:
         return image.copy()
 
+    def ask_stop(self, code: int) -> None:
+        if not self._stops:
+            self._stops = [self._errors.isend(code, rank, STOP) for rank in range(self.size) if rank != self.rank]
+
+    def stop_asked(self) -> int:
+        self._look_for_errors()
+        while self._errors.Iprobe(tag=STOP):
+            self._hear_stop()
+        return self._stop_code
+
+    def meet(self, meanwhile: Callable[[], Any]) -> None:
+        self._wait(self._comm.Ibarrier(), meanwhile)
+        asked = bool(self._stops)
+        for _ in range(self.total(int(asked)) - asked - self._told):  # which have not arrived yet
+            self._hear_stop()
+        self._stops, self._told, self._stop_code = [], 0, 0
+
+    def _hear_stop(self):
+        """Receive what another rank has sent by :meth:`ask_stop`."""
+        self._stop_code = self._errors.recv(tag=STOP)
+        self._told += 1
+
     def barrier(self) -> None:
         if self.node_size > 1:
             self._wait(self._node.Ibarrier())
@@ -242,23 +266,28 @@ class MPI(Serial):
         """Wait until all ranks are here."""
         self._wait(self._comm.Ibarrier())
 
-    def _wait(self, request):
+    def _wait(self, request, meanwhile=lambda: None):
         """Wait for the end of what ranks do together, or for word of an error."""
         begun = None
         while not request.Test():
-            if self._errors.Iprobe():
-                self._stuck = True
-                self._raised = self._errors.recv()
-                self._end_at_exit()
-                raise self._raised
+            self._look_for_errors()
+            meanwhile()
             now = time.monotonic()
             begun = begun or now
             time.sleep(0 if now - begun < SPIN else NAP)
 
+    def _look_for_errors(self):
+        """Raise what another rank has raised."""
+        if self._errors.Iprobe(tag=ERROR):
+            self._stuck = True
+            self._raised = self._errors.recv(tag=ERROR)
+            self._end_at_exit()
+            raise self._raised
+
     def _tell(self, error):
         """Send word of this rank's error to all others."""
         self._raised, words = error, _portable(error, self.rank)
-        self._sent = [self._errors.isend(words, rank) for rank in range(self.size) if rank != self.rank]
+        self._sent = [self._errors.isend(words, rank, ERROR) for rank in range(self.size) if rank != self.rank]
         self._end_at_exit()
 
     def _end_at_exit(self):

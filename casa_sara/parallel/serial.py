@@ -122,6 +122,16 @@ class Serial:
         """Return an image of `images` as an array that only this rank writes to."""
         return image
 
+    def ask_stop(self, code: int) -> None:
+        """Ask the other ranks to stop, each at its next :meth:`stop_asked`; `code`, not 0, says why."""
+
+    def stop_asked(self) -> int:
+        """Return the code with which another rank has asked to stop, else 0; raise what another rank has raised."""
+        return 0
+
+    def meet(self, meanwhile: Callable[[], Any]) -> None:
+        """Wait until all ranks are here, and call `meanwhile` again and again until then."""
+
     def barrier(self) -> None:
         """Wait until what the ranks of this machine have written can be read."""
 

@@ -77,7 +77,7 @@ def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False)
     minor, ends, done = {}, [], 0
     for number, channel in enumerate(result.channels):
         if channel.result:
-            minor[number] = {0: _minor(channel.result, _stop_code(channel, result))}
+            minor[number] = {0: _minor(channel.result, result.code_of(channel))}
             ends += [done + end for end in minor[number][0]["iterDone"]]
             done = ends[-1] if ends else 0
     sara = {
@@ -89,7 +89,7 @@ def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False)
         "nthreads": options.nthreads,
         "forecast": dict(result.forecast),
         "outframe": result.frame,
-        "channels": [_channel(channel, _stop_code(channel, result), options, full) for channel in result.channels],
+        "channels": [_channel(channel, result.code_of(channel), options, full) for channel in result.channels],
     }
     return _outcome(options, ends, result.stop_code, minor, sara)
 
@@ -106,12 +106,6 @@ def _outcome(options, ends, code, minor, sara):
         "summaryminor": {0: minor},
         "sara": sara,
     }
-
-
-def _stop_code(channel, cube):
-    """Return the stop code of a channel: for one that was not solved, the code of the run."""
-    solved = channel.result and channel.result.reconstruction
-    return solved.record.stop_code if solved else cube.stopped or ITERATION_LIMIT
 
 
 def _channel(channel, code, options, full):
@@ -155,6 +149,9 @@ def _sara(result, options, full):
         "nthreads": options.nthreads,
         "forecast": dict(result.forecast),
     }
+    if result.subbands is not None:
+        sara["spectra"] = {"frequencies_hz": result.subbands.freqs_hz, "reference_hz": result.subbands.reference_hz,
+                           "shares": result.subbands.shares}
     return sara | _solution(result, options, full)
 
 
@@ -180,7 +177,10 @@ def _solution(result, options, full):
         if solved.jackknife is not None:
             sara["jackknife"] = {"groups": solved.jackknife.asked, "made": len(solved.jackknife)}
         sara["reweightings"] = [dict(update) for update in record.reweightings]
-        sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds} for iteration, bounds in record.bounds]
+        blocks = len(result.blocks)  # without that of a single dish
+        sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds[:blocks]} for iteration, bounds in record.bounds]
+        if solved.total_power:
+            sara["total_power"] = dict(solved.total_power)
         if full:
             columns = ("iteration", "reweighting", "rel_change", "residual_norm", "model_flux", "model_max")
             sara["history"] = {name: np.array(getattr(record, name)) for name in columns}
@@ -198,6 +198,8 @@ def _block(result, j):
         "samples": block.samples,
         "noise_measured": float(result.noise[j]),
     }
+    if block.band_hz:
+        entry["band_hz"] = list(block.band_hz)
     if solved:
         entry["l2_bound"] = float(solved.l2_bounds[j])
         entry["residual_norm"] = float(solved.residual_norms[j])

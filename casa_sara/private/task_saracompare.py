@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from casa_sara.analysis.comparison import Comparison
+from casa_sara.analysis.cube_comparison import CubeComparison
 from casa_sara.analysis.folder import MEASURES, PAGE, in_the_way
+from casa_sara.casa.images.image_sets import has_channels
 from casa_sara.casa.runtime import log
+from casa_sara.comparison.compare_cubes import compare_cubes
 from casa_sara.comparison.compare_images import compare_images
 from casa_sara.options import Comparing, Selection
 from casa_sara.private.parameters import SARACOMPARE
@@ -36,7 +39,10 @@ def saracompare(**parameters: Any) -> dict[str, Any]:
                          "places of the sources")
     request = Comparing(models, names, parameters["truth"], regions, parameters["support"], parameters["threshold"],
                         parameters["robust"], frames, inject, parameters["injectflux"], features, available_cores())
-    comparison = compare_images(request, selection)
+    if any(map(has_channels, models)):
+        comparison = compare_cubes(request, selection)
+    else:
+        comparison = compare_images(request, selection)
     if folder:
         _report(comparison, folder)
     return comparison.measures
@@ -80,8 +86,13 @@ def _words(value):
     return tuple(word for word in ([value] if isinstance(value, str) else value) if word)
 
 
-def _report(comparison: Comparison, folder: Path) -> None:
+def _report(comparison: Comparison | CubeComparison, folder: Path) -> None:
     """Write the report, its pictures and the measures."""
-    from casa_sara.analysis.report import write_report  # matplotlib takes its time
+    if isinstance(comparison, CubeComparison):
+        from casa_sara.analysis.cube_report import write_cube_report  # matplotlib takes its time
+
+        write_cube_report(comparison, folder)
+        return
+    from casa_sara.analysis.report import write_report
 
     write_report(comparison, folder)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +28,17 @@ from casa_sara.casa.runtime.quantities import hertz, radians, seconds
 from casa_sara.imaging.continuum import make_image
 from casa_sara.imaging.cube import make_cube
 from casa_sara.imaging.dry_run import dry_run
-from casa_sara.options import Comparing, ImageGrid, ImagingRequest, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import (
+    Comparing,
+    ImageGrid,
+    ImagingRequest,
+    Limits,
+    Output,
+    Selection,
+    SingleDish,
+    SolverOptions,
+    Weighting,
+)
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.private.launch import in_parallel
 from casa_sara.private.summary import cube_summary, summary
@@ -39,12 +48,15 @@ from casa_sara.version import __version__
 __all__ = ["selection_of", "tsara"]
 
 ARCSEC = math.pi / 180 / 3600
+MOST_TERMS = 6
 
 
 def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     _check_method(parameters)
     _refuse_for_mosaics(parameters)
+    _check_single_dish(parameters)
+    _refuse_for_spectra(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -67,13 +79,14 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
                          "in the first lines of the log of a normal run, and docs/parallel.md explains its time")
     if parameters["dryrun"]:
         return {"forecast": dry_run(selection, grid, options, _blocks(parameters), limits)}
-    make, tell = (make_cube, cube_summary) if grid.is_cube else (partial(make_image, comm=comm), summary)
+    make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
-        result = make(ImagingRequest(selection, grid, weighting, options, output, limits),
-                      lambda result: tell(result, options, full=True)["sara"])
+        dish = SingleDish(parameters["sdimage"], parameters["sdpsf"], parameters["sdgain"])
+        result = make(ImagingRequest(selection, grid, weighting, options, output, limits, dish),
+                      lambda result: tell(result, options, full=True)["sara"], comm)
         if parameters["report"]:
-            comm.once(_report, output.imagename, selection, options.nthreads)
+            comm.once(_report, output.imagename, selection, options.nthreads, grid.is_cube)
         elif not output.images_stand:
             comm.once(folder.remove, Path(output.imagename + REPORT))  # of older images
     return comm.bcast(tell(result, options, parameters["fullsummary"]))
@@ -101,14 +114,17 @@ def _warn_of_incomplete(vis, output):
                  "with it before tsara with restart=True, niter=0, savemodel='modelcolumn' has written it again")
 
 
-def _report(imagename, selection, nthreads):
+def _report(imagename, selection, nthreads, cube):
     """Write the report of one run."""
+    from casa_sara.analysis.cube_report import write_cube_report
     from casa_sara.analysis.report import write_report
+    from casa_sara.comparison.compare_cubes import compare_cubes
     from casa_sara.comparison.compare_images import compare_images
 
     log.info("writing the report")
-    comparison = compare_images(Comparing((imagename,), nthreads=nthreads), selection, single=True)
-    write_report(comparison, Path(imagename + REPORT), f"tsara: {Path(imagename).name}")
+    compare, write = (compare_cubes, write_cube_report) if cube else (compare_images, write_report)
+    comparison = compare(Comparing((imagename,), nthreads=nthreads), selection, single=True)
+    write(comparison, Path(imagename + REPORT), f"tsara: {Path(imagename).name}")
 
 
 def selection_of(parameters: dict[str, Any]) -> Selection:
@@ -132,7 +148,8 @@ def _grid(parameters):
     return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
                      spectralindex=_spectral_index(parameters), usemask=parameters["usemask"], mask=_mask(parameters),
-                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], **_spectral(parameters))
+                     pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], nterms=parameters["nterms"],
+                     **_spectral(parameters))
 
 
 def _spectral_index(parameters):
@@ -159,24 +176,9 @@ def _refuse_for_cubes(parameters):
     """Raise on parameters that are for continuum images only."""
     if parameters["specmode"] != "cube":
         return
-    if parameters["savemodel"] != "none":
-        raise ValueError(f"savemodel = '{parameters['savemodel']}' with specmode = 'cube': MODEL_DATA is written "
-                         "from continuum images only; should be 'none'")
-    if parameters["parallel"]:
-        raise ValueError("parallel = True with specmode = 'cube': only continuum images can be shared by several "
-                         "processes; should be False. Channels can be divided among several runs with start and nchan")
-    if parameters["stokes"] != "I":
-        raise ValueError(f"stokes = '{parameters['stokes']}' with specmode = 'cube': cubes can only be made in "
-                         "Stokes I; should be 'I'")
-    if parameters["usemask"] == "pb" or parameters["mask"]:
-        raise ValueError(f"usemask = '{parameters['usemask']}', mask = {parameters['mask']!r} with specmode = 'cube': "
-                         "masks can only be used for continuum images; should be usemask = 'user', mask = ''")
     if parameters["npixels"]:
         raise ValueError(f"npixels = {parameters['npixels']} with specmode = 'cube': cubes use the uv cell of the "
                          "image only; should be 0")
-    if parameters["report"]:
-        raise ValueError("report = True with specmode = 'cube': reports are made for continuum images only; should be "
-                         "False")
 
 
 def _check_errors(parameters):
@@ -204,6 +206,47 @@ def _refuse_for_mosaics(parameters):
                                 ("jackknife", False, "errors by jackknife are of single pointings only")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
+
+
+def _check_single_dish(parameters):
+    """Raise on parameters that do not go with a single dish."""
+    image = parameters["sdimage"]
+    if not parameters["sdgain"] > 0:
+        raise ValueError(f"sdgain = {parameters['sdgain']!r}: should be positive; 1 leaves the flux scale as it is")
+    if not image:
+        return
+    for name, right, reason in (("specmode", "mfs", "total power is for continuum images"),
+                                ("stokes", "I", "total power is of Stokes I"),
+                                ("method", "tsara", "the paper has no total power"),
+                                ("databound", "adapt", "the noise of sdimage is found, it has no weights"),
+                                ("spectralindex", "", "the sky has to be the same at all frequencies"),
+                                ("nterms", 1, "the sky has to be the same at all frequencies"),
+                                ("ndraws", 0, "its errors are not found by bootstrap"),
+                                ("jackknife", False, "its errors are not found by jackknife"),
+                                ("parallel", False, "total power takes one process")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with sdimage = '{image}': {reason}; should be {right!r}")
+
+
+def _refuse_for_spectra(parameters):
+    """Raise on parameters that unknown spectra do not have."""
+    nterms = parameters["nterms"]
+    if not 1 <= nterms <= MOST_TERMS:
+        raise ValueError(f"nterms = {nterms}: should be from 1 to {MOST_TERMS}")
+    if nterms == 1:
+        return
+    for name, right, reason in (("gridder", "standard", "other operators are of flat, or of known spectra"),
+                                ("method", "tsara", "the paper's method has one image"),
+                                ("stokes", "I", "spectra are those of the brightness"),
+                                ("positivity", True, "the brightness is positive at all frequencies"),
+                                ("spectralindex", "", "either the index is known, or it is solved for"),
+                                ("parallel", False, "spectra take one process"),
+                                ("report", False, "reports are made of one image"),
+                                ("savemodel", "none", "MODEL_DATA is written of one image"),
+                                ("ndraws", 0, "errors by bootstrap are of one image"),
+                                ("jackknife", False, "errors by jackknife are of one image")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 
 
 def _check_stokes(parameters):

@@ -6,6 +6,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import prod
+from typing import Any
 
 import numpy as np
 
@@ -15,10 +17,12 @@ from casa_sara.data.outliers import find_wild
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
+from casa_sara.operators.single_dish import Stacked
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.total_power import Beside, TotalPower, WhitenedDish
 from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import NNLSFit, nnls
 
@@ -28,6 +32,7 @@ ROUNDS = 6  # of leaving out wild samples, and of another first image
 LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
 MOST_HALVINGS = 8  # what is still wrong in cells 256 times smaller is not due to them
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
+STEEPEST = 2.0  # spectral index for which averages over frequency are made, where it is not known
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
 
@@ -47,6 +52,8 @@ class Samples:
         Noise of each block measured from the data, in units of what the weights say; NaN where unknown.
     kept : int (M,)
         Numbers of the samples in the data given.
+    total_power : TotalPower, optional
+        What a single dish has measured, a block of its own after those of the samples.
     """
 
     data: Visibilities
@@ -54,6 +61,7 @@ class Samples:
     density: np.ndarray
     noise: np.ndarray | None = None
     kept: np.ndarray = field(default=None)  # type: ignore[arg-type]  # all of them: see below
+    total_power: TotalPower | None = None
 
     def __post_init__(self):
         self.offsets = np.asarray(self.offsets)
@@ -102,8 +110,9 @@ class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
     `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
-    `samples` where that is None. `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image
-    times `sky_over_image`.
+    `samples` where that is None; those of a single `dish`, where there is one, come after them, a block of their own.
+    `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image times `sky_over_image`; with
+    `subbands` the images of several frequencies are stacked.
     """
 
     samples: Samples
@@ -116,6 +125,8 @@ class Problem:
     support: np.ndarray | None = None
     averaged: Averaged | None = None
     sky_over_image: np.ndarray | None = None
+    dish: WhitenedDish | None = None
+    subbands: Any = None
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - four have a default
@@ -155,7 +166,7 @@ class Problem:
         vis, offsets = data.vis * root_weight, samples.offsets
         measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy),
                                beam=data.beam)
-        precond = _preconditioner(samples, options.precondition, comm)
+        precond = of_samples = _preconditioner(samples, options.precondition, comm, grid.subbands)
         averaged = None
         if options.averages and grid.mosaic is None:
             with suppress(OverflowError):  # hardly two samples share one of so many cells
@@ -167,12 +178,34 @@ class Problem:
             precond = averaged.weighted_mean(precond).astype(np.float32)
             root_weight = np.sqrt(averaged.sum_of_weights, dtype=np.float32, casting="same_kind")
             measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy))
+        dish = None
+        if samples.total_power is not None:
+            dish = samples.total_power.whitened(grid.shape, float(data.weight.sum(dtype=float)), unit_jy,
+                                                measurement.workers)
+            alone = float(prod(grid.shape))  # of one sample
+            of_dish = dish.precond(_norm_sq(samples, of_samples, grid, unit_jy) if options.precondition else alone)
+            measurement = Stacked(measurement, dish.operator)
+            vis, precond = np.concatenate([vis, dish.vis]), np.concatenate([precond, of_dish])
+            offsets = np.append(offsets, vis.size)
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
             data_norm_sq = float(comm.bcast(power_method(
-                lambda image: whole.adjoint(precond * whole.forward(image)), grid.shape, dtype=np.float32)))
+                lambda image: whole.adjoint(precond * whole.forward(image)), measurement.shape, dtype=np.float32)))
+        if support is not None and grid.subbands is not None:
+            support = np.tile(support, (grid.subbands.count, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
-                   grid.mosaic and grid.mosaic.over)
+                   grid.mosaic and grid.mosaic.over, dish, grid.subbands)
+
+    @property
+    def renewing(self) -> Averaged | Beside | None:
+        """What makes the averages anew, None where there are none."""
+        return self.averaged if self.averaged is None or self.dish is None else Beside(self.averaged, self.dish.vis)
+
+    @property
+    def block_sizes(self) -> np.ndarray:
+        """Samples of each block on this rank, before they were averaged; int (d,)."""
+        sizes = np.diff(self.samples.offsets)
+        return sizes if self.dish is None else np.append(sizes, self.dish.vis.size)
 
     def flux_jy(self, image: np.ndarray) -> float:
         """Return Σ|I| of the sky of an image, which no visibility of it exceeds.
@@ -186,6 +219,9 @@ class Problem:
         -------
         float
         """
+        if self.subbands is not None:
+            fluxes = np.abs(self.subbands.split(image)).sum(axis=(1, 2), dtype=float)
+            return self.unit_jy * float((np.abs(self.subbands.factors(self.subbands.band_hz)).T @ fluxes).max())
         sky = image if self.sky_over_image is None else image * self.sky_over_image
         return self.unit_jy * float(np.abs(sky).sum(dtype=float))
 
@@ -204,6 +240,8 @@ def averaging_cell(grid: ImageGrid) -> np.ndarray:
         Along v, u, w and ln ν.
     """
     index = 0.0 if grid.spectrum is None else float(np.abs(grid.spectrum.index).max())
+    if grid.subbands is not None:
+        index = STEEPEST
     depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
     return cell_sides(grid.shape, grid.cell_rad, depth, index)
 
@@ -240,6 +278,7 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         problem = problem_of(samples, finer=finer)
         first, left = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                            NNLSFit(positivity=options.positivity), stopped, problem.support)
+        left = left[: left.size - (0 if problem.dish is None else problem.dish.vis.size)]
         residual = left if problem.averaged is None else problem.averaged.residual(first)
         error = _averaging_error(problem, residual, left, comm)
         if error.max() > LARGEST_ERROR and finer.max() < MOST_HALVINGS and not stopped():
@@ -253,6 +292,8 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         samples, finer, rounds = samples.without(found.index), np.zeros_like(finer), rounds + 1
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
     norms = _norms(residual, samples.offsets, comm)
+    if problem.dish is not None:
+        norms = np.append(norms, problem.dish.noise_norm(options.positivity, problem.support))
     return problem, Findings(left_out, wild, norms, problem.data_norm_sq, finer, float(error.max())), first
 
 
@@ -281,15 +322,27 @@ def _told_of_all(found, samples, layout, comm):
     return [told for _, told in sorted(sum(comm.allgather(list(numbered)), []), key=lambda one: one[0])]
 
 
-def _preconditioner(samples, wanted, comm):
+def _norm_sq(samples, precond, grid, unit_jy):
+    """About ‖U^½Φ‖² of the visibilities, from what the samples of a uv cell have together, ΣUw, times the pixels."""
+    data = samples.data
+    of_cells = np.median(precond * samples.density * (data.weight / data.imaging_weight))
+    return float(of_cells) * prod(grid.shape) * unit_jy**2
+
+
+def _preconditioner(samples, wanted, comm, subbands=None):
     """U = 1/density, largest value 1.
 
     Samples of very low weight that are alone in their uv cells (bad data that were down-weighted instead of flagged)
     are not raised to the weight of other cells: the density is taken to be at least 1e-2·Σw²/Σw.
+
+    Of several frequencies it is that times Σ_t g_t², g_t what each image contributes to the sample: where in the uv
+    plane there are but samples of the edges of the band, these would weigh up to T² times as much as the others.
     """
     weight = samples.data.weight
     if not wanted:
         return np.ones(weight.size, np.float32)
     mean = comm.total(float(np.square(weight, dtype=float).sum())) / comm.total(float(weight.sum(dtype=float)))
     precond = 1.0 / np.maximum(np.asarray(samples.density, float), LIGHT * mean)
+    if subbands is not None:
+        precond /= np.square(subbands.factors(samples.data.freq_hz)).sum(axis=0)
     return (precond / comm.largest(precond.max(initial=0))).astype(np.float32)

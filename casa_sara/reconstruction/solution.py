@@ -10,6 +10,7 @@ import numpy as np
 
 from casa_sara.data.distribution import Layout
 from casa_sara.operators.dictionary import SaraDictionary
+from casa_sara.operators.subbands import SubbandDictionary
 from casa_sara.options import SolverOptions
 from casa_sara.parallel.partition import RankAssignment
 from casa_sara.reconstruction.bootstrap import Bootstrap, Jackknife, jackknife_groups
@@ -19,9 +20,11 @@ from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_thre
 from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import bounds_of
+from casa_sara.reconstruction.total_power import MOST, WhitenedDish
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperStage
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
+from casa_sara.solver.planes import Planes
 from casa_sara.solver.record import DIVERGED, UNFINISHED, SolverRecord
 from casa_sara.solver.reweighting import Stage
 from casa_sara.solver.significance import SignificantSupport
@@ -42,6 +45,8 @@ class Solution:
     stage: Stage | PaperStage | None = None
     result: Reconstruction | None = None
     resamplings: dict[str, Bootstrap] = field(default_factory=dict)
+    dish: WhitenedDish | None = None
+    subbands: Any = None
 
     @classmethod
     def of(cls, problem: Problem, found: Findings, options: SolverOptions, ranks: RankAssignment) -> Solution:
@@ -64,20 +69,30 @@ class Solution:
         """
         measurement, samples = problem.measurement, problem.samples
         nx, ny = measurement.shape
-        dictionary = SaraDictionary((nx, ny), ranks.wavelets(options.wavelets), options.wavelevels,
-                                    nthreads=options.nthreads, n_bases=len(options.wavelets))
+        subbands, planes = problem.subbands, _planes(problem.subbands, options.positivity)
+        dictionary: Any = SaraDictionary((nx // planes.count, ny), ranks.wavelets(options.wavelets), options.wavelevels,
+                                         nthreads=options.nthreads, n_bases=len(options.wavelets))
+        if subbands is not None:
+            dictionary = SubbandDictionary(dictionary, subbands.orders)
         if options.method == PAPER:
             ppd = paper_iteration(problem, dictionary, found.data_norm_sq, options.positivity)
         else:
             ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=ranks.comm)
-        ppd.unit_jy, ppd.averaged, ppd.sky_over_image = problem.unit_jy, problem.averaged, problem.sky_over_image
-        ppd.samples = ranks.comm.exscan(np.diff(samples.offsets))[1]
+        ppd.unit_jy, ppd.averaged, ppd.sky_over_image = problem.unit_jy, problem.renewing, problem.sky_over_image
+        ppd.planes = planes
+        ppd.samples = ranks.comm.exscan(problem.block_sizes)[1]
         if problem.support is not None:
             ppd.confine(problem.support)
         weights = samples.data.weight * np.float32(problem.unit_jy**2)
-        weight_sums = ranks.comm.block_sums(weights, samples.offsets)
-        return cls(found, ppd, bounds_of(ppd, found.nnls_norms, weight_sums, samples.noise, options))
+        weight_sums, noise, dish = ranks.comm.block_sums(weights, samples.offsets), samples.noise, problem.dish
+        most: float | np.ndarray = np.inf
+        if dish is not None:
+            most = np.append(np.full(weight_sums.size, np.inf), MOST)
+            weight_sums = np.append(weight_sums, dish.weight_sum)
+            noise = None if noise is None else np.append(noise, np.nan)
+        bounds = bounds_of(ppd, found.nnls_norms, weight_sums, noise, options, most)
+        return cls(found, ppd, bounds, dish=dish, subbands=subbands)
 
     def state(self, stage: Stage | PaperStage | None, layout: Layout, ranks: RankAssignment) -> dict[str, Any]:
         """Return, on rank 0, all that :func:`resume` needs beside data and parameters, as one rank alone has it.
@@ -163,7 +178,7 @@ def begin(samples: Samples, problem_of: Callable[..., Problem], options: SolverO
     """
     problem, found, first = first_image(samples, problem_of, options, stopped, ranks.comm)
     if startmodel is not None:
-        startmodel = startmodel / np.float32(problem.unit_jy)
+        startmodel = _planes(problem.subbands).stacked(startmodel / np.float32(problem.unit_jy))
         if problem.support is not None:
             startmodel *= problem.support
     if options.method == PAPER:
@@ -250,6 +265,13 @@ def _plain_state(state, comm):
     spread = {name: state["ppd"].pop(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)} if comm.rank == 0 else {}
     state = comm.bcast(state)
     return state | dict(ppd=state["ppd"] | {name: spread.get(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)})
+
+
+def _planes(subbands, positivity=True):
+    """Return the planes of the unknown."""
+    if subbands is None:
+        return Planes()
+    return Planes(np.sqrt(subbands.shares), subbands.reference_weights(), positivity)
 
 
 def _is_noise_only(ppd, bounds):

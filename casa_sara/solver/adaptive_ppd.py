@@ -10,6 +10,7 @@ import numpy as np
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.solver import _kernels as kernels
 from casa_sara.solver.interfaces import Measurement, Prior
+from casa_sara.solver.planes import Planes
 from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.prox import ellipsoid_multiplier
 
@@ -129,6 +130,8 @@ class AdaptivePPD:
         Jy/pixel in the unit of the model, for the record.
     sky_over_image : real (nx, ny) or None
         Of a mosaic, by which the model is multiplied to be the sky, for the record.
+    planes : Planes
+        Those of which (nx, ny) are stacked here, where the sky is solved for at several frequencies.
     """
 
     def __init__(self, measurement: Measurement, dictionary: Prior,  # noqa: PLR0913 - Φ, Ψ, y, U of the paper
@@ -166,6 +169,7 @@ class AdaptivePPD:
         self.iteration = 0
         self.unit_jy = 1.0
         self.sky_over_image: np.ndarray | None = None
+        self.planes = Planes()
 
     @property
     def scratch_vis(self) -> np.ndarray:
@@ -318,6 +322,9 @@ class AdaptivePPD:
         sums = [*sums.tolist(), float(greatest)]
         change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
+        if self.planes.count > 1:
+            seen = self.planes.at_reference(self.model)
+            self.model_flux, self.model_max = float(seen.sum(dtype=float)), float(seen.max())
         if self.sky_over_image is not None:
             sky = np.multiply(self.model, self.sky_over_image, out=self.scratch_image)
             self.model_flux, self.model_max = float(sky.sum(dtype=float)), float(sky.max())

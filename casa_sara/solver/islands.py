@@ -38,9 +38,10 @@ def look_at(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, record: Solv
         Whether the residual holds structure of more than 5 standard deviations over more than a beam.
     """
     filter_ = matched_filter(ppd, bounds)
-    gradient = gradient_image(ppd, bounds, ppd.model)
+    gradient = ppd.planes.mean(gradient_image(ppd, bounds, ppd.model))
     record.residual_snr = ppd.comm.once(_peaks, filter_, gradient)
-    record.islands = ppd.comm.once(islands_of, ppd.model, filter_.psf, ppd.unit_jy, ppd.sky_over_image)
+    record.islands = ppd.comm.once(islands_of, ppd.planes.at_reference(ppd.model), filter_.psf, ppd.unit_jy,
+                                   ppd.sky_over_image)
     return any(entry["snr"] > STRUCTURE for entry in record.residual_snr if entry["beams"] >= 1)
 
 

@@ -56,13 +56,14 @@ class Release:
         int
             Number of pixels with a negative lower bound that had none before.
         """
-        lobes = LOBE * maximum_filter(ppd.model, 2 * REACH + 1)
+        around_pixel = (1, 2 * REACH + 1, 2 * REACH + 1)  # of each plane
+        lobes = (LOBE * maximum_filter(ppd.planes.split(ppd.model), around_pixel)).reshape(ppd.model.shape)
         asked, before = _asked(ppd, bounds, lobes), self._asked
         self._asked = asked
         again = (before < 0) & (asked < PERSISTENT * before)
         if not again.any():
             return 0
-        around = binary_dilation(again, np.ones((2 * REACH + 1, 2 * REACH + 1), bool))
+        around = binary_dilation(ppd.planes.split(again), np.ones(around_pixel, bool)).reshape(again.shape)
         count = np.count_nonzero(ppd.lowest)
         ppd.comm.barrier()  # all ranks of one machine have counted, and write the same
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around & (ppd.lowest < np.inf))
@@ -89,8 +90,8 @@ def _asked(ppd, bounds, lobes):
     weights = ppd.precond * np.repeat(bounds.noise_weights.astype(ppd.precond.dtype), np.diff(ppd.offsets))
     image, vis = ppd.scratch_image, ppd.scratch_vis
     # what a pixel of 1 changes in its gradient, Σ U w/σ², and the variance of the gradient, Σ U² w/σ²
-    image.fill(0)
-    image[(0, 0) if ppd.sky_over_image is None else tuple(n // 2 for n in image.shape)] = 1  # one that is seen
+    place = (0, 0) if ppd.sky_over_image is None else tuple(n // 2 for n in image.shape)  # one that is seen
+    ppd.planes.set_pixel(image, place)
     ppd.measurement.forward(image, vis)
     power = np.abs(vis)
     power *= power

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["CONVERGED", "DIVERGED", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER", "STOP_DESCRIPTIONS",
-           "STRUCTURED", "SolverRecord", "TIME_LIMIT", "UNFEASIBLE", "UNFINISHED"]
+__all__ = ["CONVERGED", "DIVERGED", "EMPTY_MASK", "ITERATION_LIMIT", "NOISE_ONLY", "STOPPED_BY_USER",
+           "STOP_DESCRIPTIONS", "STRUCTURED", "SolverRecord", "TIME_LIMIT", "UNFEASIBLE", "UNFINISHED"]
 
 CONVERGED, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, DIVERGED, UNFEASIBLE = 101, 102, 103, 104, 105, 106
-TIME_LIMIT, STRUCTURED = 107, 108
+TIME_LIMIT, STRUCTURED, EMPTY_MASK = 107, 108, 109
 STOP_DESCRIPTIONS = {
     CONVERGED: "converged",
     ITERATION_LIMIT: "iteration limit",
@@ -21,6 +21,7 @@ STOP_DESCRIPTIONS = {
     UNFEASIBLE: "converged, but the data do not fit the bounds",
     TIME_LIMIT: "time limit",
     STRUCTURED: "converged, but the residual is not noise",
+    EMPTY_MASK: "the mask is empty",
 }
 UNFINISHED = (STOPPED_BY_USER, TIME_LIMIT)  # which a restart takes up again
 

@@ -67,14 +67,15 @@ class SignificantSupport:
         int
             Pixels of the support.
         """
-        gradient = gradient_image(ppd, bounds, ppd.model)
+        planes = ppd.planes
+        gradient = planes.mean(gradient_image(ppd, bounds, ppd.model))
         if self._noise_weights is None or not np.array_equal(self._noise_weights, bounds.noise_weights):
             self._psf, self._filter, self._noise_weights = point_response(ppd, bounds), None, bounds.noise_weights
-        allowed = np.ones(ppd.model.shape, bool) if ppd.confined_to is None else ppd.confined_to
-        support, points = ppd.comm.once(self._found, gradient, ppd.model, allowed, ppd.positivity,
+        allowed = np.ones(gradient.shape, bool) if ppd.confined_to is None else planes.split(ppd.confined_to)[0]
+        support, points = ppd.comm.once(self._found, gradient, planes.mean(ppd.model), allowed, ppd.positivity,
                                         ppd.measurement.workers.count)
         self.begun = True
-        ppd.support_only(support, points)
+        ppd.support_only(planes.repeated(support), planes.points(points, ppd.model.shape))
         return int(np.count_nonzero(support))
 
     def _found(self, gradient, model, allowed, positivity, workers):
@@ -144,11 +145,10 @@ def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> np
     real (nx, ny)
     """
     vis, image = ppd.scratch_vis, ppd.scratch_image
-    image.fill(0)
-    image[tuple(n // 2 for n in image.shape)] = 1
+    ppd.planes.set_pixel(image, tuple(n // 2 for n in ppd.planes.split(image).shape[1:]))
     ppd.measurement.forward(image, vis)
     vis *= _whitening(ppd, bounds)
-    return ppd.adjoint(vis, image).copy()
+    return ppd.planes.mean(ppd.adjoint(vis, image)).copy()
 
 
 def gradient_image(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, model: np.ndarray) -> np.ndarray:

@@ -154,17 +154,41 @@ class _tsara:
         with its flux kept. It is in Jy/pixel, or in a unit that can be converted to it as mJy/pixel.
         Where the data constrain the sky it changes the time that the solver takes, not the result. On
         scales that no baseline measures, the result keeps part of it (from a quarter to all in
-        trials), so a single-dish image helps, but does not guarantee the total flux. For that,
-        feather .image afterwards.
+        trials), so a single-dish image helps, but does not guarantee the total flux: sdimage does.
         Example: startmodel='first.model'
+
+    sdimage : str, default ''
+        A single-dish image of the same sky, CASA's or a FITS file, which gives the total power and the
+        scales that the baselines do not measure. It is data, as the visibilities are: a block of its own,
+        whose noise is found as that of any block. It is in Jy/beam (or in K of the main beam, with beam and
+        frequency in its header), of one plane, on any grid and in any frame, and may be masked. It is used
+        where it and the image overlap, at points half a beam apart, but for a margin of 0.35 of its beam
+        along the edges of what is modelled: what the dish sees beyond the image is taken for empty, and
+        has to be less than a fifth of its beam. Its frequency must be within 2 per cent of that of the image.
+        The dish sees the sky itself. With gridder='mosaic' that is the model; else the model is the sky times
+        the primary beam, by which it is divided here, down to a tenth or to pblimit. .residual is of the
+        visibilities alone; .model and .image hold both.
+        The block counts as much as 3 per cent of the visibilities at most, whatever its noise.
+        Not available with it: specmode='cube', stokes other than 'I', method='dabbech2018', databound other
+        than 'adapt', spectralindex, ndraws, jackknife and parallel=True.
+        Example: sdimage='tp.image'
+
+    sdpsf : str, default ''
+        Opened by sdimage = other than ''.
+        An image of the beam of sdimage, 1 at its maximum, which is taken for the centre. '' takes the
+        Gaussian beam in the header of sdimage.
+
+    sdgain : float, default 1.0
+        Opened by sdimage = other than ''.
+        sdimage is multiplied by it.
 
     specmode : {'mfs', 'cube'}, default 'mfs'
         'mfs'   one continuum image of all selected channels. The sky is assumed to have the same
                 brightness at all frequencies, unless spectralindex gives its spectral index. A
                 source of another spectrum is averaged over the band; in a wide band this leaves
                 errors around it that no model can fit (with a spectral index of -0.8 it loses 43 %
-                of its brightness from 1 to 2 GHz). The frequency dependence of the primary beam is
-                not modelled.
+                of its brightness from 1 to 2 GHz), and nterms > 1 solves for it. The frequency
+                dependence of the primary beam is not modelled.
         'cube'  an image of each channel, on the spectral axis that tclean makes of the same
                 parameters. The channels are solved one after the other, each from its own data,
                 with its own blocks, bounds and beam; niter and the blocks are those of a channel.
@@ -187,6 +211,22 @@ class _tsara:
         (tclean has no such parameter.)
         Examples: spectralindex=-0.7
                   spectralindex='clean.alpha'
+
+    nterms : int, default 1
+        Opened by specmode = 'mfs'.
+        With 2 or more, the spectrum of every pixel is solved for together with its brightness: as a
+        polynomial of so many terms in the logarithm of the frequency, that is, by images at so many
+        frequencies, none of them negative. Mean, slope, curvature … of the spectra are sparse each,
+        so that where the data show no slope the spectrum is flat. 3 serve an octave, 2 a band of 20
+        percent. .model, .image and .residual are at reffreq; .alpha is the spectral index of the
+        model smoothed to the beam of .psf, .alpha.error its error by the noise, both masked where
+        that is above 0.3; .subbands is the model at the frequencies that were solved for. Blocks
+        are divided by frequency, too. Memory and time go with nterms. As in tclean the spectra are
+        those of the sky as seen by the antennas, whose primary beam becomes narrower with
+        frequency: beyond the middle of the field .alpha is steeper than that of the sky. Only with
+        gridder='standard', and not with spectralindex, report, savemodel, ndraws, jackknife,
+        parallel.
+        Example: nterms=3
 
     nchan : int, default -1
         Opened by specmode = 'cube'.
@@ -325,8 +365,9 @@ class _tsara:
 
     restoringbeam : str or list of str, default []
         Opened by restoration = True.
-        [] fits a Gaussian to the main lobe of the psf. With another beam, the residual is convolved
-        to the same resolution.
+        [] fits a Gaussian to the main lobe of the psf, of each channel in a cube; 'common' is the
+        smallest beam that holds those of all channels. With another beam, the residual is convolved to
+        the same resolution.
         Examples: restoringbeam='0.3arcsec'
                   restoringbeam=['8arcsec', '10arcsec', '45deg']
 
@@ -378,7 +419,9 @@ class _tsara:
         Opened by usemask = 'user'.
         A region in CASA's text format (CRTF), a file of them, or an image of ones and zeros on any
         grid, CASA's or a FITS file; or a list of these, whose union counts. '' is no mask. An entry
-        that selects nothing of the image is refused.
+        that selects nothing of the image is refused. In a cube, a region (without a range of its own)
+        and an image of one channel hold in every channel; an image of as many channels as the cube has
+        a mask for each.
         Examples: mask='circle[[40pix,40pix],10pix]'
                   mask='old.mask'
                   mask=['regions.crtf', 'circle[[19h59m28.5s, 40d44m02s], 100arcsec]']
@@ -548,7 +591,9 @@ class _tsara:
     report : bool, default False
         True writes a page with the images, residuals with natural and Briggs weights, convergence, the
         noise found in every snapshot, and all numbers: imagename.report/report.html, and its pictures
-        beside it. The task saracompare writes the same for several images.
+        beside it. Of a cube it shows the spectrum, the maps of the line, all channels with their
+        residuals, and noise and islands of each. The task saracompare writes the same for several
+        images.
 
     restart : bool, default False
         True continues a run that was killed, was stopped with Ctrl-C, or whose machine went down. It
@@ -570,7 +615,8 @@ class _tsara:
         self-calibration, after the images have been written. 'none' leaves the MeasurementSets
         untouched. Together with restart=True and niter=0 it writes the visibilities of the existing
         imagename.model and keeps the images, for example after a run was killed while it wrote the
-        column.
+        column. Of a cube, each sample has the model of the channel that it belongs to, and 0 where it
+        belongs to none.
 
     parallel : bool, default False
         True shares data, wavelets and memory among the processes (ranks) of an MPI job, on one
@@ -578,8 +624,8 @@ class _tsara:
         script.py", where every rank calls the task, or with "mpicasa -n 5 casa -c script.py", where
         casampi's client has its servers do it. It takes mpi4py (pip install casa_sara[mpi]) and Open
         MPI or MPICH. nthreads, and maxmem, are those of each rank; nthreads=0 shares the cores of a
-        machine among its ranks. See docs/parallel.md. False runs in one process, with nthreads
-        threads.
+        machine among its ranks. Of a cube, each rank solves some of the channels, and needs the memory
+        of one process. See docs/parallel.md. False runs in one process, with nthreads threads.
 
     Returns
     -------
@@ -587,13 +633,15 @@ class _tsara:
       As tclean's: iterdone, niter, nmajordone, stopcode, stopDescription, summarymajor,
       summaryminor. Stop codes: 101 converged, 102 iteration limit, 103 noise only, 104 stopped by
       user, 105 diverged, 106 converged but the data do not fit the bounds, 107 time limit,
-      108 converged but the residual is not noise (more than 5 sigma over a beam or more).
+      108 converged but the residual is not noise (more than 5 sigma over a beam or more), 109 the
+      mask of this channel is empty.
       The key 'sara' holds its own record: the islands of emission ('islands': place, flux with its
       error, S/N, size; with ndraws bootstrap_error_jy, the error that the draws give; with
       jackknife jackknife_error_jy), the largest S/N of the residual by width ('residual_snr'), the
       noise and bound of each block with its snapshot ('blocks'), to how many averages the
       visibilities were reduced for the solver, in uv cells of which size ('averaging', empty where
-      they were not), the history of re-weightings and iterations, the parameters that were
+      they were not), how many points of sdimage were used and the noise found of them in Jy/beam
+      ('total_power', where there is one), the history of re-weightings and iterations, the parameters that were
       chosen automatically and why, how many samples were left out for which reason ('dropped'), and
       the iterations from which the run was resumed ('resumed').
 
@@ -625,16 +673,17 @@ class _tsara:
     def __call__(
         self, vis='', selectdata=True, field='', spw='', timerange='', uvrange='', antenna='', scan='', observation='',
         intent='', datacolumn='corrected', imagename='', imsize=[100], cell=[], phasecenter='', stokes='I',
-        projection='SIN', startmodel='', specmode='mfs', reffreq='', spectralindex='', nchan=-1, start='', width='',
-        outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest', perchanweightdensity=True,
-        gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False, mosweight=True, pblimit=0.2,
-        weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True, restoringbeam=[], pbcor=False,
-        method='tsara', niter=100000, wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'],
-        wavelevels=4, usemask='user', mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt',
-        boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20,
-        reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0,
-        ndraws=0, jackknife=False, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False,
-        report=False, restart=False, overwrite=False, savemodel='none', parallel=False,
+        projection='SIN', startmodel='', sdimage='', sdpsf='', sdgain=1.0, specmode='mfs', reffreq='', spectralindex='',
+        nterms=1, nchan=-1, start='', width='', outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest',
+        perchanweightdensity=True, gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False,
+        mosweight=True, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True,
+        restoringbeam=[], pbcor=False, method='tsara', niter=100000,
+        wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
+        mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
+        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
+        reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, ndraws=0, jackknife=False, blocks=0,
+        nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False,
+        overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())

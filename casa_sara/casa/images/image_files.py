@@ -14,7 +14,7 @@ from casa_sara.casa.images.sky_image import check_sky_axes, unit_of
 from casa_sara.casa.runtime.quantities import radians
 from casa_sara.casa.runtime.tools import opened
 
-__all__ = ["read_model", "write_image"]
+__all__ = ["read_model", "read_spectra", "write_image"]
 
 
 def write_image(name, pixels, plane, unit="", beam=None, masked=False):
@@ -115,6 +115,26 @@ def read_model(name, plane, channel=0):
     if not np.isfinite(pixels).all():
         raise ValueError(f"startmodel = '{name}' holds pixels that are not finite")
     return on_plane(pixels * np.float32(factor), PixelMap(csys, plane), plane.shape)
+
+
+def read_spectra(name):
+    """Return the model at several frequencies.
+
+    Parameters
+    ----------
+    name : str
+        Image .subbands of a run of tsara.
+
+    Returns
+    -------
+    freqs_hz : float64 (T,)
+    spectra : float32 (T, nx, ny)
+        Jy/pixel.
+    """
+    with opened_image(name) as ia:
+        count, csys = ia.shape()[3], ia.coordsys()
+        freqs_hz = [csys.toworld([0, 0, 0, plane])["numeric"][3] for plane in range(count)]
+        return np.array(freqs_hz), np.array([read_pixels(ia, number=plane) for plane in range(count)])
 
 
 def _conversion(name, unit):

@@ -17,7 +17,7 @@ from casa_sara.casa.ms.subtables import readable
 from casa_sara.casa.runtime.quantities import check_frequency
 from casa_sara.casa.runtime.tools import check_handles, made, more_handles, opened, scratch_folder
 
-__all__ = ["ImagePlane", "define_image_plane", "read_pixels", "slabs"]
+__all__ = ["ImagePlane", "define_image_plane", "read_pixels", "read_planes", "slabs"]
 
 PB_LIMIT = 0.2  # of tclean
 _SELECTDATA_KEYS = {"timerange": "timestr", "uvrange": "uvdist", "observation": "obs", "intent": "state"}
@@ -81,6 +81,25 @@ class ImagePlane:
         mask = pb > abs(pblimit)
         return replace(self, pb=np.where(mask, pb, np.float32(0)), mask=mask, sky_model=True)
 
+    def csys_at(self, freqs_hz):
+        """Return the record of the same coordinates, but for the frequencies.
+
+        Parameters
+        ----------
+        freqs_hz : float (n,)
+            Of the planes of a cube.
+
+        Returns
+        -------
+        dict
+        """
+        import casatools
+
+        csys = casatools.coordsys()
+        csys.fromrecord(self.csys)
+        csys.setspectral(frequencies=casatools.quanta().quantity(list(freqs_hz), "Hz"))
+        return csys.torecord()
+
     @property
     def channels(self) -> int:
         """Planes along the spectral axis."""
@@ -127,7 +146,7 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
                 _make_primary_beam(visibilities, selection, grid, root, diameters=True)
         path = made(root + ".pb", f"vis = {list(selection.vis)}")
         with opened("image", path) as ia:
-            pb = _read_planes(ia) if grid.is_cube else read_pixels(ia)
+            pb = read_planes(ia) if grid.is_cube else read_pixels(ia)
             csys, miscinfo = ia.coordsys().torecord(), ia.miscinfo()
         with opened("table", path) as tb:
             imageinfo = tb.getkeyword("imageinfo")
@@ -190,12 +209,12 @@ def read_pixels(ia, getmask=False, number=0):
     return pixels
 
 
-def _read_planes(ia):
-    """Return all planes (nchan, nx, ny) of an open cube."""
-    nx, ny, _, nchan = ia.shape()
-    planes = np.empty((nchan, nx, ny), np.float32)
-    for number in range(nchan):
-        planes[number] = read_pixels(ia, number=number)
+def read_planes(ia, getmask=False):
+    """Return all planes (nchan, nx, ny) of an open cube: float32, or bool for its mask."""
+    nx, ny, *rest = ia.shape()
+    planes = np.empty((int(np.prod(rest)), nx, ny), bool if getmask else np.float32)
+    for number, plane in enumerate(planes):
+        plane[...] = read_pixels(ia, getmask, number)
     return planes
 
 

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from casa_sara.casa.images.fits_files import opened_image
 from casa_sara.casa.images.products import DRAWS, RECORD
 from casa_sara.casa.images.record import read_record
+from casa_sara.casa.images.sky_cube import SkyCube, read_sky_cube
 from casa_sara.casa.images.sky_image import SkyImage, read_header, read_sky_image
 
-__all__ = ["ImageSet", "check_same_data", "data_names", "read_frames", "read_image_set"]
+__all__ = ["ImageSet", "check_same_data", "data_names", "has_channels", "read_frames", "read_image_set"]
 
 _SUFFIXES = ("", ".fits", ".fits.gz")
 _NAMES = (".model", ".model.fits", ".model.fits.gz", ".fits", ".fits.gz")
@@ -27,27 +29,30 @@ class ImageSet:
     ----------
     name : str
         How the comparison calls it.
-    model : SkyImage
+    model : SkyImage or SkyCube
         Jy/pixel.
-    residual : SkyImage or None
+    residual : SkyImage, SkyCube or None
         Jy/beam.
-    beam : (float, float, float) or None
-        Of the restored image, else of the residual or the PSF: arcsec, arcsec, degrees.
+    beam : (float, float, float), list of these or None
+        Of the restored image, else of the residual or the PSF: arcsec, arcsec, degrees; of each channel of a cube.
     parameters : dict
         Task parameters in the history of the images.
     record : dict
         What tsara recorded, else empty.
     draws : str
         File of the draws of a bootstrap, '' where there is none.
+    spectra : str
+        Image of the model at several frequencies, '' where its spectra were not solved for.
     """
 
     name: str
-    model: SkyImage
-    residual: SkyImage | None = None
-    beam: tuple[float, float, float] | None = None
+    model: SkyImage | SkyCube
+    residual: SkyImage | SkyCube | None = None
+    beam: tuple[float, float, float] | list[tuple[float, float, float]] | None = None
     parameters: dict[str, str] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
     draws: str = ""
+    spectra: str = ""
 
     def called(self, name):
         """Return the same with another name."""
@@ -64,7 +69,16 @@ class ImageSet:
         return self.parameters.get("weighting", "")
 
 
-def read_image_set(given, name="", with_residual=True):
+def has_channels(given):
+    """Tell whether a product is a cube; False where there is none, or no image, which reading it explains."""
+    try:
+        with opened_image(_model_path(given, "models")[0]) as ia:
+            return len(ia.shape()) > 2 and int(np.prod(ia.shape()[2:])) > 1
+    except (FileNotFoundError, RuntimeError):
+        return False
+
+
+def read_image_set(given, name="", with_residual=True, cube=False):
     """Read the products with one name.
 
     Parameters
@@ -75,6 +89,8 @@ def read_image_set(given, name="", with_residual=True):
         What to call it; '' is the root without its folder.
     with_residual : bool
         Read the residual image, where there is one.
+    cube : bool
+        They are cubes, whose channels are read when they are asked for.
 
     Returns
     -------
@@ -86,18 +102,19 @@ def read_image_set(given, name="", with_residual=True):
         There is no model, or an image is not as it should be.
     """
     path, root = _model_path(given, "models")
-    model = read_sky_image(path, "models", ("Jy/pixel",))
+    read = read_sky_cube if cube else read_sky_image
+    model = read(path, "models", ("Jy/pixel",))
     found = _beside(root, ".residual")
-    residual = read_sky_image(found, "models", ("Jy/beam", "")) if found and with_residual else None
+    residual = read(found, "models", ("Jy/beam", "")) if found and with_residual else None
     parameters, beams = {}, []
     for kind in (".image", ".residual", ".psf"):
-        beam, of_image = read_header(_beside(root, kind)) if _beside(root, kind) else (None, {})
+        beam, of_image = read_header(_beside(root, kind), cube) if _beside(root, kind) else (None, {})
         beams.append(beam)
         parameters |= of_image
     record = root + RECORD
     return ImageSet(name or os.path.basename(root), model, residual, next(filter(None, beams), None),
                     parameters | model.parameters, read_record(record) if os.path.isfile(record) else {},
-                    root + DRAWS if os.path.isfile(root + DRAWS) else "")
+                    root + DRAWS if os.path.isfile(root + DRAWS) else "", _beside(root, ".subbands"))
 
 
 def read_frames(names, plane):

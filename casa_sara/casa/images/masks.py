@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 
 from casa_sara.casa.images.fits_files import is_fits, opened_image
 from casa_sara.casa.images.image_files import write_image
-from casa_sara.casa.images.image_plane import read_pixels
+from casa_sara.casa.images.image_plane import read_planes
 from casa_sara.casa.images.sky_image import check_sky_axes
 from casa_sara.casa.runtime.tools import made, opened, scratch_folder
 
@@ -30,7 +31,7 @@ def read_support(grid, plane):
 
     Returns
     -------
-    bool (nx, ny), or None where there is no mask
+    bool (nx, ny), or (nchan, nx, ny) of a cube, or None where there is no mask
 
     Raises
     ------
@@ -45,7 +46,7 @@ def read_support(grid, plane):
         return support
     if not grid.mask:
         return None
-    support = np.zeros(plane.shape, bool)
+    support = np.zeros(plane.pb.shape, bool)
     for entry in grid.mask:
         found = _mask_of(entry, plane) & ((plane.pb > grid.pbmask) | (grid.pbmask == 0))
         if not found.any():
@@ -59,18 +60,18 @@ def read_support(grid, plane):
 
 
 def _mask_of(entry, plane):
-    """Return the mask that tclean makes of one entry, bool (nx, ny): empty where it cannot read it."""
+    """Return the mask that tclean makes of one entry, bool, as of the primary beam: empty where it cannot read it."""
     import casatools
 
     deconvolver = casatools.synthesisdeconvolver()
-    with scratch_folder(plane.shape) as folder:
+    with scratch_folder((*plane.shape, plane.channels)) as folder:
         root = os.path.join(folder, "support")
         _write_what_tclean_needs(root, plane)
         try:
-            wanted = _as_tclean_reads(entry, root + ".given")
+            wanted = _as_tclean_reads(entry, root + ".given", plane)
             deconvolver.setupdeconvolution({
-                "imagename": root, "deconvolver": "hogbom", "specmode": "mfs", "startmodel": "", "restoringbeam": [],
-                "usemask": "user", "mask": wanted})
+                "imagename": root, "deconvolver": "hogbom", "specmode": "cube" if plane.pb.ndim > 2 else "mfs",
+                "startmodel": "", "restoringbeam": [], "usemask": "user", "mask": wanted})
             deconvolver.initminorcycle()
             deconvolver.setupmask()
         except (RuntimeError, UnicodeDecodeError) as error:
@@ -79,14 +80,15 @@ def _mask_of(entry, plane):
         finally:
             deconvolver.done()
         with opened("image", made(root + ".mask", f"mask = '{entry}'")) as ia:
-            return read_pixels(ia) > 0
+            return read_planes(ia).reshape(plane.pb.shape) > 0
 
 
-def _as_tclean_reads(entry, copy):
+def _as_tclean_reads(entry, copy, plane):
     """Return the name of a mask as tclean takes it.
 
     Of an image that is FITS, or lacks axes, that is a copy, of which Stokes and frequency say nothing: tclean would
-    convert the latter, and fail where the telescope is not known.
+    convert the latter, and fail where the telescope is not known. Its planes, where it has several, are those of the
+    cube in their order.
     """
     if not is_fits(entry) and not os.path.isfile(os.path.join(entry, "table.dat")):
         return os.path.abspath(entry) if os.path.exists(entry) else entry  # a region, or a file of them
@@ -95,11 +97,16 @@ def _as_tclean_reads(entry, copy):
         check_sky_axes(entry, "mask", csys)
         if not is_fits(entry) and all(csys.findcoordinate(kind)["return"] for kind in ("stokes", "spectral")):
             return os.path.abspath(entry)
-        if shape[2:].prod() != 1:
-            raise ValueError(f"mask = '{entry}' has the shape {shape.tolist()}: should be one Stokes, one channel")
-        plane = ia.subimage(dropdeg=True)
-        plane.adddegaxes(copy, spectral=True, stokes="I").done()
-        plane.done()
+        if shape[2:].prod() == 1:
+            flat = ia.subimage(dropdeg=True)
+            flat.adddegaxes(copy, spectral=True, stokes="I").done()
+            flat.done()
+            return copy
+        if shape[2:].prod() != plane.channels or shape[2:].max() != plane.channels:
+            right = f"one channel, or {plane.channels}" if plane.channels > 1 else "one channel"
+            raise ValueError(f"mask = '{entry}' has the shape {shape.tolist()}: should be one Stokes, {right}")
+        there = replace(plane, csys=plane.csys | {"direction0": csys.torecord()["direction0"]})
+        write_image(copy, np.where(read_planes(ia, True), read_planes(ia), np.float32(0)), there)
     return copy
 
 
@@ -107,8 +114,9 @@ def _write_what_tclean_needs(root, plane):
     """Write the images that CASA needs with a mask: all empty, except the primary beam and a point spread function."""
     nx, ny = plane.shape
     x, y = np.arange(nx)[:, None] - nx // 2, np.arange(ny)[None, :] - ny // 2
-    images = {".psf": np.exp(-(x**2 + y**2) / 8.0).astype(np.float32), ".pb": plane.pb}
+    point = np.exp(-(x**2 + y**2) / 8.0).astype(np.float32)
+    images = {".psf": np.broadcast_to(point, plane.pb.shape), ".pb": plane.pb}
     for suffix in (".residual", ".model"):
-        images[suffix] = np.zeros(plane.shape, np.float32)
+        images[suffix] = np.zeros(plane.pb.shape, np.float32)
     for suffix, pixels in images.items():
         write_image(root + suffix, pixels, plane, masked=suffix == ".pb")

@@ -1,6 +1,6 @@
 """What one run leaves under one name: the images .psf .residual .model .image .sumwt .pb, those asked for beside them
-(.mask .image.pbcor .model.pbcor .model.error .image.error .image.jackknife .draws.npz), .weight of a mosaic, and the
-record .sara.json.
+(.mask .image.pbcor .model.pbcor .model.error .image.error .image.jackknife .draws.npz), .weight of a mosaic, .alpha
+.alpha.error .subbands of spectra, and the record .sara.json.
 
 They appear together (:mod:`casa_sara.runtime.atomic`), and replace those of an older run of this name together.
 """
@@ -12,7 +12,7 @@ import math
 import os
 import shutil
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -32,7 +32,8 @@ __all__ = [
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
-ON_REQUEST = (".mask", ".weight", ".image.pbcor", ".model.pbcor", ".model.error", ".image.error", ".image.jackknife")
+ON_REQUEST = (".mask", ".weight", ".image.pbcor", ".model.pbcor", ".model.error", ".image.error", ".image.jackknife",
+              ".alpha", ".alpha.error", ".subbands")
 DRAWS = ".draws.npz"  # of a bootstrap
 CHECKPOINT = ".checkpoint"  # of a run that has not finished; no product
 RECORD, REPORT = ".sara.json", ".report"  # the report, a folder, is written by the task after the others
@@ -112,7 +113,8 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
         residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'weight' of a mosaic, 'model.error', 'image.error' and
-        'image.jackknife' where there are; 'draws' is a dict of arrays, kept as `DRAWS`.
+        'image.jackknife' where there are; 'draws' is a dict of arrays, kept as `DRAWS`. Of spectra, 'alpha' and
+        'alpha.error', bool 'known' (nx, ny) where they are known, and 'subbands' (T, nx, ny) in Jy/pixel at 'freqs_hz'.
     sumwt : float, or one for each channel
         Sum of the imaging weights.
     beam : dict
@@ -128,7 +130,8 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
         The images could not be written, as on a full disk; everything is as it was before.
     """
     images, draws = {name: image for name, image in images.items() if name != "draws"}, images.get("draws")
-    more = 2 * output.pbcor + sum(name not in ("psf", "residual", "model") for name in images)
+    more = 2 * output.pbcor + sum(max(np.size(image) // math.prod(plane.pb.shape), 1) for name, image in images.items()
+                                  if name not in ("psf", "residual", "model"))
     check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:
@@ -166,6 +169,8 @@ def write_images(root, plane, images, sumwt, beam, output):
     if output.pbcor:
         write_corrected(root, plane, seen)
     _write_errors(root, plane, images, beam, output)
+    if "subbands" in images:
+        _write_spectra(root, plane, images, beam)
     for path in existing_products(root):
         with opened("image", path) as ia:
             ia.sethistory(origin="tsara", history=list(output.history))
@@ -178,6 +183,15 @@ def _write_errors(root, plane, images, beam, output):
     for name in {"image.error", "image.jackknife"} & images.keys():
         restored = restored_beam(list(output.restoringbeam), beam)
         write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored, masked=plane.masks_all)
+
+
+def _write_spectra(root, plane, images, beam):
+    """Write the images of the spectra."""
+    known = replace(plane, mask=images["known"])
+    for name in ("alpha", "alpha.error"):
+        write_image(f"{root}.{name}", images[name], known, beam=beam, masked=True)
+    write_image(root + ".subbands", images["subbands"], replace(plane, csys=plane.csys_at(images["freqs_hz"])),
+                unit="Jy/pixel")
 
 
 def _not_written(imagename, needed, scratch, error):

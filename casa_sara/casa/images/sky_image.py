@@ -14,7 +14,8 @@ from casa_sara.casa.images.regrid import PixelMap, corners, interpolated, on_pla
 from casa_sara.casa.images.units import brightness_unit
 from casa_sara.casa.runtime.tools import safe_record
 
-__all__ = ["SkyImage", "SkyPlane", "beam_numbers", "check_sky_axes", "read_header", "read_sky_image", "unit_of"]
+__all__ = ["SkyImage", "SkyPlane", "beam_numbers", "check_finite", "check_sky_axes", "check_stokes_i", "parameters_of",
+           "read_header", "read_sky_image", "unit_in", "unit_of"]
 
 _PARAMETER = re.compile(r"(\w+)\s*=\s*(.*)")
 _SAME_PLACE = 1e-6  # pixels
@@ -168,7 +169,7 @@ class SkyImage:
                                                         plane=plane)
 
 
-def read_sky_image(name, parameter, units):
+def read_sky_image(name, parameter, units, holes=False):
     """Read one image plane.
 
     Parameters
@@ -179,6 +180,8 @@ def read_sky_image(name, parameter, units):
         Task parameter that named it, for messages.
     units : sequence of str or None
         What is right here: out of 'Jy/pixel', 'Jy/beam', ''; units that can be converted to these are. None takes any.
+    holes : bool
+        Pixels may be masked, or not finite, and are NaN then; else the mask is not looked at.
 
     Returns
     -------
@@ -196,27 +199,50 @@ def read_sky_image(name, parameter, units):
             shape, given, beam = tuple(int(n) for n in ia.shape()), ia.brightnessunit(), ia.restoringbeam()
             csys, history = ia.coordsys(), ia.history(list=False)
             check_sky_axes(name, parameter, csys)
-            _check_plane(name, parameter, shape, csys)
+            if int(np.prod(shape[2:])) != 1:
+                raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one "
+                                 "channel")
+            check_stokes_i(name, parameter, csys)
             pixels = read_pixels(ia)
+            if holes:
+                pixels[~read_pixels(ia, getmask=True) | ~np.isfinite(pixels)] = np.nan
     except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
+    unit, factor = unit_in(units, name, parameter, given, csys)
+    pixels *= np.float32(factor)
+    if not holes:
+        check_finite(name, parameter, pixels)
+    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]),
+                    parameters_of(history))
+
+
+def unit_in(units, name, parameter, given, csys):
+    """Return unit and factor of an image in unit `given`; raise where it is none of `units`, None taking any."""
     unit, factor = unit_of(given, csys)
     if units is not None and unit not in units:
         right = " or ".join(f"'{word}'" for word in units if word)
         hint = "; the model is the image before it is convolved with the beam" if unit == "Jy/beam" else ""
         raise ValueError(f"{parameter} = '{name}' is in '{given}': should be in {right}{hint}")
-    pixels *= np.float32(factor)
+    return unit, factor
+
+
+def check_finite(name, parameter, pixels):
+    """Raise unless all pixels are finite."""
     bad = int(np.sum(~np.isfinite(pixels)))
     if bad:
         raise ValueError(f"{parameter} = '{name}' holds {bad} pixels that are not finite (NaN): all should be numbers")
-    return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]),
-                    _parameters(history))
 
 
-def read_header(name):
-    """Return the beam of an image, None where it has none, and the task parameters in its history."""
+def read_header(name, cube=False):
+    """Return the beam of an image, None where it has none, and the task parameters in its history.
+
+    Of a cube that is a list with the beam of each channel.
+    """
     with opened_image(name) as ia:
-        return beam_numbers(ia.restoringbeam()), _parameters(ia.history(list=False))
+        record, parameters = ia.restoringbeam(), parameters_of(ia.history(list=False))
+        channels = range(int(np.prod(ia.shape()[2:]))) if cube else ()
+    beams = [beam_numbers(record, channel) for channel in channels or (0,)]
+    return (beams if cube and None not in beams else None if cube else beams[0]), parameters
 
 
 def check_sky_axes(name, parameter, csys):
@@ -244,21 +270,19 @@ def unit_of(text, csys):
     return "Jy/pixel", factor * float(abs(np.prod(sky["cdelt"]) * np.linalg.det(sky["pc"])))
 
 
-def _check_plane(name, parameter, shape, csys):
-    """Raise unless there is one plane, of Stokes I."""
-    if int(np.prod(shape[2:])) != 1:
-        raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one channel")
+def check_stokes_i(name, parameter, csys):
+    """Raise unless an image is of Stokes I, or says nothing of it."""
     stokes = csys.stokes() if csys.findcoordinate("stokes")["return"] else ["I"]
     if stokes[0] in ("Q", "U", "V"):
         raise ValueError(f"{parameter} = '{name}' is of Stokes {stokes[0]}: should be of Stokes I, as what it is "
                          "compared with")
 
 
-def beam_numbers(record):
-    """Return CASA's restoring beam as plain numbers, None where there is none."""
+def beam_numbers(record, channel=0):
+    """Return CASA's restoring beam, or that of a channel, as plain numbers, None where there is none."""
     import casatools
 
-    record = record.get("beams", {}).get("*0", {}).get("*0", record)
+    record = record.get("beams", {}).get(f"*{channel}", {}).get("*0", record)
     if not record or "major" not in record:
         return None
     qa = casatools.quanta()
@@ -267,7 +291,7 @@ def beam_numbers(record):
     return major, minor, float(qa.convert(angle, "deg")["value"])
 
 
-def _parameters(history):
+def parameters_of(history):
     """Return the task parameters in the lines of a history; of several runs the last one counts."""
     parameters = {}
     for line in history:

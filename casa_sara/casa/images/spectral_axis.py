@@ -72,8 +72,9 @@ class SpectralAxis:
 def _frequencies(csys, nchan):
     """Return the frequencies of all channels in Hz, as the coordinates give them now."""
     pixels = np.repeat(csys.referencepixel()["numeric"][:, None], nchan, axis=1)
-    pixels[3] = np.arange(nchan)
-    return csys.toworldmany(pixels)["numeric"][3]
+    axis = int(csys.findcoordinate("spectral")["pixel"][0])
+    pixels[axis] = np.arange(nchan)
+    return csys.toworldmany(pixels)["numeric"][axis]
 
 
 def _step(csys):

@@ -14,7 +14,7 @@ from casa_sara.casa.images.sky_image import SkyPlane, read_sky_image
 from casa_sara.casa.runtime.quantities import hertz
 from casa_sara.options import LARGEST_INDEX, Spectrum
 
-__all__ = ["check_spectral_index", "spectral_band", "with_spectrum"]
+__all__ = ["check_spectral_index", "reference_hz", "spectral_band", "with_spectrum"]
 
 
 def check_spectral_index(text):
@@ -55,7 +55,7 @@ def with_spectrum(grid, plane, reference=None):
     plane, reference = (SkyPlane(one.csys, tuple(one.shape)) for one in (plane, reference or plane))
     value = _number(grid.spectralindex)
     index = _index_image(grid.spectralindex, plane) if value is None else value
-    return replace(grid, spectrum=Spectrum(index, _reference_hz(reference)))
+    return replace(grid, spectrum=Spectrum(index, reference_hz(reference)))
 
 
 def spectral_band(grid, freq_range_hz):
@@ -74,9 +74,20 @@ def _number(text):
         return None
 
 
-def _reference_hz(plane):
-    """Return the frequency of the spectral axis."""
-    csys = plane.coordinates()
+def reference_hz(plane):
+    """Return the frequency of the spectral axis.
+
+    Parameters
+    ----------
+    plane : ImagePlane or SkyPlane
+        Of one channel.
+
+    Returns
+    -------
+    float
+        Hz.
+    """
+    csys = SkyPlane(plane.csys, tuple(plane.shape)).coordinates()
     return float(csys.convert(csys.referencevalue()["numeric"], unitsout=["rad", "rad", "", "Hz"])[3])
 
 
