@@ -14,6 +14,7 @@ SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at t
 SLAB = 64  # lines squared at a time
 SAMPLES, MOST_DRAWS = 100_000, 16  # realisations of the noise have so many samples together, or are so many
 APPROXIMATIONS = 0.12  # of the prior on them within a support: they hold the flux, and little of the noise
+SLOPES = 2.0  # docs/decisions.md, "Unknown spectra"
 POINTS = 0.25  # of the prior, on sources that one point explains
 
 
@@ -75,13 +76,16 @@ def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confin
         A support confines the model.
     """
     noise, pixel = band_noise(ppd, bounds)
-    for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel) * _shares(ppd, confined)):
+    for band, scale in zip(ppd.dictionary.bands(), _band_scales(ppd, noise, pixel) * _shares(ppd, confined)):
         ppd.l1_weights[band.slice] = scale
 
 
-def _band_scales(noise, pixel):
-    """ν of every band."""
-    return np.maximum(noise / pixel, 1.0)
+def _band_scales(ppd, noise, pixel):
+    """ν of every band: of slopes and higher orders of spectra twice as much, as they are smaller than the mean."""
+    scales = np.maximum(noise / pixel, 1.0)
+    if ppd.planes.count > 1:
+        scales[[band.order > 0 for band in ppd.dictionary.bands()]] *= SLOPES
+    return scales
 
 
 def _shares(ppd, confined):
@@ -109,7 +113,7 @@ def reweight(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, scale: floa
         Whether the model is confined to what is significant.
     """
     noise, pixel = band_noise(ppd, bounds)
-    scales = _band_scales(noise, pixel)
+    scales = _band_scales(ppd, noise, pixel)
     alpha = scale * np.minimum(noise, pixel) / (scales if confined else 1.0)
     ppd.dictionary.reweight(ppd.model, alpha, scales * _shares(ppd, confined), ppd.l1_weights)
     if len(ppd.points):
