@@ -181,6 +181,7 @@ def test_two_frequencies_reach_the_minimiser_that_slsqp_finds():
     bounds = AdaptiveBounds(np.array([0.3, 0.4]) * np.sqrt(2.0 * samples), samples, np.array([20.0, 30.0]), 2,
                             rel_change=0.0)
     first_weights(ppd, bounds)
+    assert ppd.l1_weights[0].min() == 1 and ppd.l1_weights[1].min() >= 2  # slopes are smaller than the mean
     bounds.apply_to(ppd)
     for _ in range(15_000):
         ppd.step()

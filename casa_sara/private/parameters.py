@@ -3,7 +3,7 @@
 from casa_sara.private.validation import Parameter
 
 SARACOMPARE = (
-    Parameter('models', ('string', 'stringVec'), '', 'Names of the products to compare, two or more', required=True),
+    Parameter('models', ('string', 'stringVec'), '', 'Names of the products to compare, two or more; one for features or inject', required=True),
     Parameter('names', ('string', 'stringVec'), [], 'Names of the products in the report; []: their file names'),
     Parameter('outdir', ('string',), '', "Folder for the report; '': none"),
     Parameter('vis', ('path', 'pathVec'), [], "Name of visibility file(s) to compare all models with; '': none", mustexist=True),
