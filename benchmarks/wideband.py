@@ -42,8 +42,7 @@ SHORT, LONG = (0, 0.6, 1.8, 5.4), (0, 0.6, 1.8, 5.4, 16)
 GRID = {
     "briggs": (SHORT, 0.0, 4000, "briggs"), "briggs biased": (SHORT, 0.6, 4000, "briggs"),
     "briggs deep": (SHORT, 0.0, 20_000, "briggs"), "briggs long": (LONG, 0.0, 4000, "briggs"),
-    "briggs long deep": (LONG, 0.0, 20_000, "briggs"), "briggs deeper": (SHORT, 0.0, 100_000, "briggs"),
-    "natural": (SHORT, 0.0, 4000, "natural"),
+    "briggs long deep": (LONG, 0.0, 20_000, "briggs"), "briggs deeper": (SHORT, 0.0, 60_000, "briggs"),
 }  # fmt: skip
 TUNED_ON = "S M31"
 

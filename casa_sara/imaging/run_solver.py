@@ -33,7 +33,7 @@ from casa_sara.version import __version__
 
 __all__ = ["Watch", "at_odds", "checkpoint_of", "density_of", "expected_iterations", "solve_image", "without_wild"]
 
-AT_ODDS, OF_BRIGHTEST = 3.0, 0.02  # times what a single dish alone leaves, and of its brightest point: a warning
+AT_ODDS, OF_BRIGHTEST = 3.0, 0.01  # times what a single dish alone leaves, and of its brightest point: a warning
 MOST_NAMED = 20  # wild samples that the log names one by one
 
 
