@@ -1,6 +1,6 @@
 """How time and memory of a whole run grow with the image and with the data.
 
-    python benchmarks/scaling.py FOLDER [--picture scaling.png] [--only visibilities] [--most 1e7]
+    python benchmarks/scaling.py FOLDER [--picture scaling.png] [--only visibilities] [--least 1e6] [--most 1e7]
 
 One sky of 256² pixels (unresolved sources on extended emission) is observed by the VLA in four configurations. Images
 of 256² to 4096² pixels are made of 10⁵ visibilities; images of 1024² of 10⁴ to 10⁸ in 12 blocks (`large_ms.py`). Every
@@ -103,6 +103,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--picture", type=Path)
+    parser.add_argument("--least", type=float, default=1e4, help="visibilities")
     parser.add_argument("--most", type=float, default=1e8, help="visibilities")
     parser.add_argument("--only", choices=("pixels", "visibilities"))
     options = parser.parse_args()
@@ -116,7 +117,7 @@ def main():
         with quiet(few / "simulation.txt"):
             observe(sky, few, Array(VLA, tuple("ABCD")), 35.0)
     for name in VISIBILITIES:
-        if options.only != "pixels" and float(name) <= options.most:
+        if options.only != "pixels" and options.least <= float(name) <= options.most:
             vis[name] = [str(base / name / f"{config}.ms") for config in "ABCD"]
             if not (base / name).exists():
                 with quiet(base / f"{name}.txt"):
