@@ -42,7 +42,7 @@ SHORT, LONG = (0, 0.6, 1.8, 5.4), (0, 0.6, 1.8, 5.4, 16)
 GRID = {
     "briggs": (SHORT, 0.0, 4000, "briggs"), "briggs biased": (SHORT, 0.6, 4000, "briggs"),
     "briggs deep": (SHORT, 0.0, 20_000, "briggs"), "briggs long": (LONG, 0.0, 4000, "briggs"),
-    "natural": (SHORT, 0.0, 4000, "natural"), "natural deep": (SHORT, 0.0, 20_000, "natural"),
+    "briggs long deep": (LONG, 0.0, 20_000, "briggs"), "briggs deeper": (SHORT, 0.0, 60_000, "briggs"),
 }  # fmt: skip
 TUNED_ON = "S M31"
 
@@ -133,13 +133,13 @@ class Measures:
             found[1] = max(found[1], self._snr(self.brightness, restored))
         return found
 
-    def of_index(self, index, noise, known=None):
-        """Rms error, its median, and that by thermal noise, above each of LEVELS; and the share of pixels known."""
+    def of_index(self, index, noise, known):
+        """Rms error where it is known, its median, and that by thermal noise, above each of LEVELS; the share known."""
         found = {}
         for level in LEVELS:
             here = self.brightness > level * noise
-            valid = here & np.isfinite(index) & (True if known is None else known)
-            error = np.where(valid, index - self.index, 0)[here]
+            valid = here & np.isfinite(index) & known
+            error = (index - self.index)[valid] if valid.any() else np.full(1, np.nan)
             expected = noise / self.brightness[here] / 0.2  # 0.2 is the spread of ln ν in an octave
             found[level] = dict(pixels=int(here.sum()), rms=float(np.sqrt(np.mean(error**2))),
                                 median=float(np.median(np.abs(error))), known=float(valid.sum() / max(here.sum(), 1)),
@@ -222,7 +222,8 @@ def best_settings(folder):
     """The settings that are best on TUNED_ON."""
     found = json.loads((folder / TUNED_ON.replace(" ", "_") / "clean.json").read_text())
     return list(dict.fromkeys([max(GRID, key=lambda one: found[one]["snr"][1]),
-                               min(GRID, key=lambda one: found[one]["index"]["100"]["rms"])]))
+                               min((one for one in GRID if found[one]["index"]["30"]["known"] > 0.99),
+                                   key=lambda one: found[one]["index"]["100"]["rms"])]))
 
 
 def time_one_by_one(folder, name=TUNED_ON):

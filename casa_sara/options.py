@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 __all__ = ["LARGEST_INDEX", "Comparing", "ImageGrid", "Limits", "Output", "Selection", "SolverOptions", "Spectrum",
-           "Weighting"]
+           "SingleDish", "Weighting"]
 
 LARGEST_INDEX = 5.0  # spectral index of any continuum, plus or minus
 
@@ -194,6 +194,18 @@ class Limits:
 
 
 @dataclass(frozen=True)
+class SingleDish:
+    """Total power: names of a single-dish `image` and of its beam (`psf`), and a factor (`gain`) on its brightness.
+
+    Without an image there is none; without a psf the beam is the one in the header of the image.
+    """
+
+    image: str = ""
+    psf: str = ""
+    gain: float = 1.0
+
+
+@dataclass(frozen=True)
 class ImagingRequest:
     """What a run of tsara is asked for."""
 
@@ -203,6 +215,7 @@ class ImagingRequest:
     options: SolverOptions
     output: Output
     limits: Limits = Limits()
+    single_dish: SingleDish = SingleDish()
 
 
 @dataclass(frozen=True)

@@ -24,8 +24,8 @@ def chi_square_of_least_squares(matrix, noise_weights, vis, free):
     return float(np.linalg.lstsq(stacked, data, rcond=None)[1][0]), np.linalg.lstsq(stacked, data, rcond=None)[0]
 
 
-def test_the_change_of_chi_square_is_that_of_least_squares():
-    """Without positivity and prior: of the data, and of the draws, whose noise the seed gives."""
+def unconstrained():
+    """A dense problem without positivity and prior, its iteration and bounds, and a region of four pixels."""
     problem = Problem(seed=3, samples=(60, 80), noise=(0.05, 0.15))
     ppd = AdaptivePPD(problem.measurement, problem.dictionary, problem.vis.copy(), problem.offsets, problem.precond,
                       problem.data_norm_sq(problem.precond), positivity=False)
@@ -36,11 +36,18 @@ def test_the_change_of_chi_square_is_that_of_least_squares():
     ppd.l1_weights[...] = 0
     ppd.rescale(0.005)
     bounds.apply_to(ppd)
-    for _ in range(500):
-        ppd.step()
     region = np.zeros(problem.shape, bool)
     region[1:3, 1:3] = True
+    return problem, ppd, bounds, region
+
+
+def test_the_change_of_chi_square_is_that_of_least_squares():
+    """Without positivity and prior: of the data, and of the draws, whose noise the seed gives."""
+    problem, ppd, bounds, region = unconstrained()
+    for _ in range(500):
+        ppd.step()
     found = FeatureTest(ppd, bounds, 0.0, False).test(region, draws=4)
+    samples = problem.samples
     noise_weights, matrix = np.repeat(np.array(problem.noise) ** -2.0, samples), problem.measurement.matrix
 
     def change(vis):
@@ -57,6 +64,22 @@ def test_the_change_of_chi_square_is_that_of_least_squares():
         noise = np.concatenate([sigma * (rng.standard_normal(size) + 1j * rng.standard_normal(size))
                                 for sigma, size in zip(problem.noise, problem.samples)])
         assert drawn == pytest.approx(change(matrix[:, ~region.ravel()] @ model + noise)[0], rel=0.05, abs=0.05)
+
+
+def test_a_chi_square_that_still_falls_is_no_emission(monkeypatch):
+    """By 7 with every solution, and by 30 more with the region: the change is 30."""
+    _, ppd, bounds, region = unconstrained()
+    solutions = []
+
+    def falling(test):
+        solutions.append(test._ppd.lowest[region].max() < np.inf)
+        return 1000.0 - 7 * len(solutions) - 30 * solutions[-1]
+
+    monkeypatch.setattr(FeatureTest, "_solve", lambda test, stopped: None)
+    monkeypatch.setattr(FeatureTest, "_chi_square", falling)
+    found = FeatureTest(ppd, bounds, 0.0, False).test(region, draws=3)
+    assert found.change == 30 and np.array_equal(found.drawn, [30, 30, 30])
+    assert solutions == 4 * [False, True, False]
 
 
 def test_probabilities_are_those_of_the_scaled_chi_square_of_the_draws():

@@ -30,7 +30,7 @@ PACKAGES = {
     "tasks": set(),
     "gotasks": set(),
     "private": {"numpy", "casashell", "mpi4py", *OF_USERS, *CASA},
-    "demo": {"numpy", "finufft", "matplotlib", *CASA},
+    "demo": {"numpy", "scipy", "finufft", "matplotlib", *CASA},
     "comparison": {"numpy"},
     "imaging": {"numpy", "scipy"},
     "casa": set(),

@@ -489,6 +489,7 @@ def test_models_beside_each_other_do_not_overlap(tmp_path):
 @pytest.mark.parametrize("parameters, error, message", [
     (dict(models=[]), ValueError, r"models = \[\]: must be given"),
     (dict(models="one"), ValueError, r"models = \['one'\]: should be 2 or more products"),
+    (dict(models="one", features=EMPTY), ValueError, "features = .*has no effect without vis"),
     (dict(models=["one", "absent"]), FileNotFoundError, "models = 'absent': neither it nor 'absent.model'"),
     (dict(names=["a"]), ValueError, r"names = \['a'\]: 1 for 2 models"),
     (dict(names=["a", "a"]), ValueError, "names = .*should differ"),

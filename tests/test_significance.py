@@ -7,8 +7,10 @@ from fourier_sums import BEAM, NOISE, POINT, distance, gaussian, image, pixel, p
 
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.state_file import read, write
+from casa_sara.solver import l1_weights
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l1_weights import band_noise, first_weights, reweight
+from casa_sara.solver.l2_bounds import GivenBounds
 from casa_sara.solver.matched_filter import MatchedFilter
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, STOPPED_BY_USER, STRUCTURED, SolverRecord
 from casa_sara.solver.reweighting import Schedule, Stage, run_algorithm_2
@@ -221,6 +223,28 @@ def test_a_support_is_found_with_the_filter_of_the_present_noise(monkeypatch):
 
 def mean_square_around(coefs):
     return sum(np.roll(coefs**2, (i, j), (0, 1)) for i in (-1, 0, 1) for j in (-1, 0, 1)) / 9
+
+
+def test_the_noise_of_bands_hardly_depends_on_the_numbers_drawn(monkeypatch):
+    """√(mean diagonal of Ψ†Φ†Σ⁻¹ΦΨ) by dense matrices, in 21 samples, which are drawn 16 times."""
+    problem = Problem(noise=(0.5, 2.0))
+    ppd = AdaptivePPD(problem.measurement, problem.dictionary, problem.vis, problem.offsets, problem.precond, 1.0)
+    samples = np.diff(problem.offsets)
+    bounds = GivenBounds(np.array(problem.noise) * np.sqrt(2.0 * samples), samples, np.ones(2), 3)
+    whitened = problem.measurement.matrix / np.repeat(problem.noise, samples)[:, None]
+    covariance = (whitened.conj().T @ whitened).real / bounds.total_weight**2
+    matrix = problem.dictionary.matrix
+    variances = np.einsum("ci,ij,cj->c", matrix, covariance, matrix)
+    expected = np.sqrt([variances[band.slice].mean() for band in problem.dictionary.bands()])
+
+    def errors():
+        found = [band_noise(ppd, bounds, seed) for seed in range(20)]
+        np.testing.assert_allclose([pixel for _, pixel in found], [bands[0] for bands, _ in found], rtol=1e-12)
+        return np.sqrt(np.mean([(bands / expected - 1) ** 2 for bands, _ in found], axis=0))
+
+    several = errors()
+    monkeypatch.setattr(l1_weights, "MOST_DRAWS", 1)
+    assert several.max() < 0.08 and np.all(2.5 * several < errors())
 
 
 @pytest.mark.parametrize("confined", [False, True])

@@ -181,6 +181,7 @@ def test_two_frequencies_reach_the_minimiser_that_slsqp_finds():
     bounds = AdaptiveBounds(np.array([0.3, 0.4]) * np.sqrt(2.0 * samples), samples, np.array([20.0, 30.0]), 2,
                             rel_change=0.0)
     first_weights(ppd, bounds)
+    assert ppd.l1_weights[0].min() == 1 and ppd.l1_weights[1].min() >= 2  # slopes are smaller than the mean
     bounds.apply_to(ppd)
     for _ in range(15_000):
         ppd.step()
@@ -304,6 +305,7 @@ def test_one_term_is_what_no_terms_are(vis, tmp_path):
     assert not [name for name in os.listdir(tmp_path) if "alpha" in name or "subbands" in name]
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_to_the_same_images(vis, tmp_path, run, monkeypatch):
     from casa_sara.runtime.deadline import Deadline
 
@@ -340,6 +342,9 @@ def test_memory_and_time_are_forecast(vis, tmp_path):
 
 
 @pytest.mark.parametrize("more, message", [
+    (dict(spw="0"), "nterms = 2: the data span 0.05 % in frequency, which shows no spectrum; should be 1"),
+    (dict(reffreq="3.7GHz"), "reffreq = '3.7GHz' with nterms = 2: the data are at 4 to 8.002 GHz"),
+    (dict(reffreq="8.5GHz"), "reffreq = '8.5GHz' with nterms = 2: the data are at 4 to 8.002 GHz"),
     (dict(nterms=0), "nterms = 0: should be from 1 to 6"), (dict(nterms=7), "nterms = 7: should be from 1 to 6"),
     (dict(gridder="wproject"), "gridder = 'wproject' with nterms = 2: .*; should be 'standard'"),
     (dict(gridder="mosaic"), "gridder = 'mosaic' with nterms = 2: .*; should be 'standard'"),

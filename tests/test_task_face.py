@@ -305,7 +305,7 @@ def test_unknown_parameter_is_refused(received):
 def closing_and_opening(parameter):
     """Return the values of the parameter's opener that close it, and those that open it."""
     opener = BY_NAME[parameter.opener]
-    values = opener.allowed or ((True, False) if opener.types == ("bool",) else (0, 1))
+    values = opener.allowed or {("bool",): (True, False), ("string",): ("", "name")}.get(opener.types, (0, 1))
     if parameter.open_on:
         return [value for value in values if value not in parameter.open_on], list(parameter.open_on)
     return list(parameter.open_unless), [value for value in values if value not in parameter.open_unless]

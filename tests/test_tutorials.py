@@ -118,3 +118,16 @@ def test_line_cube(tmp_path):
     module.draw(tmp_path / "line_cube.png", tmp_path)
     assert drawn(tmp_path / "line_cube.png")
     page_agrees("line_cube", module.as_text(channels, measures), rel=0.15)
+
+
+@pytest.mark.slow
+def test_total_power(tmp_path):
+    module = tutorial("total_power")
+    truth, models, results = module.main(tmp_path)
+    fluxes = [model.sum() / truth.sum() for model in models]
+    assert fluxes[0] < 0.7 and fluxes[1] == pytest.approx(1, abs=0.02)
+    fidelity = [module.snr_at_scale(truth, model, 14 / 3) for model in models]
+    assert fidelity == pytest.approx([10.0, 34.5], abs=2)
+    module.draw(tmp_path / "picture.png", truth, models)
+    assert drawn(tmp_path / "picture.png")
+    page_agrees("total_power", module.as_text(truth, models, results))

@@ -47,7 +47,7 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     selection : Selection, optional
         The MeasurementSets and the data selected in them.
     single : bool
-        One product will do, for the report of one run.
+        One product will do, for the report of one run; it does to test features or to inject sources, too.
 
     Returns
     -------
@@ -58,7 +58,8 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     ValueError, FileNotFoundError
         The products cannot be compared; the message names the task parameter.
     """
-    sets = read_products(request, 1 if single else 2, with_residual=selection is None)
+    fewest = 1 if single or request.features or request.inject else 2
+    sets = read_products(request, fewest, with_residual=selection is None)
     first, notes = sets[0].model, []
     check_frame(first, notes)
     frames = read_frames(request.frames, first.plane.upright())

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from casatools import image
 
+from casa_sara import saracompare
 from casa_sara.analysis import metrics
 from casa_sara.analysis.plots import Column, Zoom, compare
 from casa_sara.demo.imagers import Case, Product, quiet, run_tcleans, run_tsara, write_comparison
 from casa_sara.demo.simulate import Simulation, simulate_observation
-from casa_sara.demo.sky import COMPANION_JY, CORE_JY, cyg_a_like
+from casa_sara.demo.sky import COMPANION_JY, CORE_JY, Sky, cyg_a_like
 
 __all__ = ["run"]
 
@@ -21,6 +23,7 @@ REGIONS = (
     "core = 19h59m28.356s 40d44m02.10s 0.25arcsec", "companion = 19h59m28.327s 40d44m01.874s 0.12arcsec",
     "western hotspots = 19h59m27.39s 40d44m05.4s 1.6arcsec",
 )
+FEATURE = "companion = 19h59m28.327s 40d44m01.874s 0.15arcsec"
 INJECTED = "19h59m28.356s 40d44m06.6s"  # between the lobes
 COARSER = 1.5  # pixels of the first frame of the animation
 SEED = 1
@@ -49,18 +52,33 @@ def run(folder: Path) -> None:
     write_truth(simulation, folder)
     print("\n" + table(simulation.truth, products, simulation.cell_arcsec))
     picture(folder / "cyga.png", simulation, products, samples)
-    print("  tsara with coarser pixels, and again without and with a point source injected …", flush=True)
+    print("  tsara with coarser pixels, again with a point source injected, and without the companion …", flush=True)
     run_tsara(_coarser(case), "tsara_coarser")
     frames = tuple(str(folder / name) for name in ("tsara_coarser", "tsara"))
     text, page = write_comparison(case, truth=str(folder / "truth.model"), regions=REGIONS, frames=frames,
-                                  inject=(INJECTED,))
+                                  inject=(INJECTED,), features=(FEATURE,))
     print(f"\n{text}\n\n  report: {page}")
+    print("  the same test of a sky without the companion …", flush=True)
+    test = _test_without_companion(case, sky)
+    print(f"  flux {1e3 * test['flux_jy']:.1f} mJy, chi-square without it larger by {test['delta_chi_square']:.1f}, "
+          f"p = {test['p_value']:.2g}")
 
 
 def _coarser(case: Case) -> Case:
     """Return the same field on coarser pixels."""
     imsize = [2 * round(n / COARSER / 2) for n in case.imsize]
     return Case(case.folder, case.vis, imsize, COARSER * case.cell_arcsec)
+
+
+def _test_without_companion(case: Case, sky: Sky) -> dict:
+    """Observe the sky without its companion in the same way, image it, and test the companion's place."""
+    folder = case.folder / "without_companion"
+    folder.mkdir()
+    with quiet(folder / "log.txt"):
+        simulation = simulate_observation(folder, replace(sky, points=sky.points[:0]), "ABCD", NOISE_DB, GAIN_RMS, SEED)
+        run_tsara(replace(case, folder=folder, vis=simulation.vis))
+        measures = saracompare(str(folder / "tsara"), vis=simulation.vis, datacolumn="data", features=[FEATURE])
+    return measures["products"]["tsara"]["features"]["companion"]
 
 
 def table(truth: np.ndarray, products: list[Product], cell_arcsec: float) -> str:

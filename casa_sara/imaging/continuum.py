@@ -48,6 +48,7 @@ from casa_sara.imaging.run_solver import (
 )
 from casa_sara.imaging.spectra import divided_by_band, spectral_images, with_subbands
 from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
+from casa_sara.imaging.total_power import total_power
 from casa_sara.operators.subbands import Subbands
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, ImagingRequest
@@ -56,6 +57,7 @@ from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import operator_accuracy
+from casa_sara.reconstruction.total_power import TotalPower
 from casa_sara.runtime.deadline import Deadline
 
 __all__ = [
@@ -161,13 +163,15 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
 class _Plane:
     """The plane of the image: `grid` is what was asked for, with the spectrum that belongs to the plane.
 
-    `startmodel` real (nx, ny) in Jy/pixel and `support` bool (nx, ny) are None where there is none.
+    `startmodel` real (nx, ny) in Jy/pixel, `support` bool (nx, ny) and `dish`, what a single dish tells of the sky, are
+    None where there is none.
     """
 
     image_plane: ImagePlane
     grid: ImageGrid
     startmodel: np.ndarray | None
     support: np.ndarray | None = None
+    dish: TotalPower | None = None
 
 
 @dataclass(frozen=True)
@@ -204,6 +208,7 @@ def _read(request, ranks):
     if grid.is_mosaic:
         weights = imaging_weights(data, grid, request.weighting, comm)
         plane = plane.of_mosaic(weight_image(data, grid, weights), output.pblimit)
+    dish = total_power(request.single_dish, data, plane, grid)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
@@ -215,7 +220,7 @@ def _read(request, ranks):
     support = comm.once(read_support, grid, plane)
     if support is not None and start is not None:
         start *= support
-    return data, _Plane(plane, grid, start, support)
+    return data, _Plane(plane, grid, start, support, dish)
 
 
 def _complete(request, plane, data, forecast, comm):
@@ -244,7 +249,8 @@ def _solve(request, plane, part, watch, ranks):
         return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
     watch.deadline.reserve = after_iterations(comm.total(data.size), grid.shape, request.output, request.limits,
                                               watch.deadline.elapsed()) + error_seconds(options, grid.shape)
-    samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise)
+    samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise,
+                      total_power=plane.dish)
     found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, ranks)
     list_islands(found.record, plane.image_plane, grid.cell_rad, options.significance, comm)
     used, blocks = without_wild(data, part.blocks, part.offsets, found, comm)
@@ -258,7 +264,8 @@ def _look_back(images, plane, solution, comm):
     doubtful = suspects(part.blocks, part.noise, found.l2_bounds) if found else []
     for line in named_suspects(part.blocks, doubtful):
         log.warn(line)
-    _caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
+    if plane.dish is None:
+        _caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
     if plane.support is not None:
         pixels["mask"] = check_confined(pixels["model"], plane.support)
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)

@@ -31,8 +31,9 @@ from casa_sara.solver.nnls import NNLS_ITERATIONS
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
 from casa_sara.version import __version__
 
-__all__ = ["Watch", "checkpoint_of", "density_of", "expected_iterations", "solve_image", "without_wild"]
+__all__ = ["Watch", "at_odds", "checkpoint_of", "density_of", "expected_iterations", "solve_image", "without_wild"]
 
+AT_ODDS, OF_BRIGHTEST = 3.0, 0.01  # times what a single dish alone leaves, and of its brightest point: a warning
 MOST_NAMED = 20  # wild samples that the log names one by one
 
 
@@ -175,9 +176,35 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
     if released:
         log.info(f"{released} pixels near unresolved sources were allowed to be negative, because the sources lie "
                  "between pixel centres")
+    _log_total_power(reconstruction.total_power)
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
         log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
                  f"{_reduced(norm, samples[j]):.4g}")
+
+
+def _log_total_power(found):
+    """Write to the log what became of a single dish, {} where there is none; warn where it is at odds with the rest."""
+    if not found:
+        return
+    log.info("total power: noise found {noise_jy_per_beam:#.3g} Jy/beam, rms of the residual "
+             "{residual_jy_per_beam:#.3g} Jy/beam at {points} points".format(**found))
+    if at_odds(found):
+        log.warn("sdimage and vis are at odds: the rms of what the model leaves of sdimage is "
+                 "{residual_jy_per_beam:.3g} Jy/beam, of what an image of sdimage alone leaves {alone_jy_per_beam:.3g} "
+                 "Jy/beam. Their flux scales may differ (sdgain), or their positions, or the beam of sdimage"
+                 .format(**found))
+
+
+def at_odds(found: dict[str, float]) -> bool:
+    """Return whether a single dish and the visibilities contradict each other.
+
+    Parameters
+    ----------
+    found : dict
+        `total_power` of :class:`casa_sara.reconstruction.result.Reconstruction`.
+    """
+    least = max(AT_ODDS * found["alone_jy_per_beam"], OF_BRIGHTEST * found["brightest_jy_per_beam"])
+    return found["residual_jy_per_beam"] > least
 
 
 class _Drawing:

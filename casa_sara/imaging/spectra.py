@@ -15,6 +15,8 @@ from casa_sara.operators.subbands import Subbands
 __all__ = ["LARGEST_ERROR", "divided_by_band", "spectral_images", "spectral_index", "with_subbands"]
 
 ARCSEC = np.radians(1 / 3600)
+NARROWEST = 1e-3  # band of which spectra may be solved for
+BEYOND = 0.05  # of the band, where a reference frequency may still be
 LARGEST_ERROR = 0.3  # of a spectral index that is not masked
 
 
@@ -37,11 +39,18 @@ def with_subbands(grid, data, plane):
     Raises
     ------
     ValueError
-        The data have too few frequencies.
+        The data have too few frequencies, their band is too narrow, or the reference frequency is not in it.
     """
     if grid.nterms == 1:
         return grid
     subbands = Subbands.of(data.freq_hz, data.weight, grid.nterms, reference_hz(plane))
+    low, high = subbands.band_hz
+    if high < (1 + NARROWEST) * low:
+        raise ValueError(f"nterms = {grid.nterms}: the data span {100 * (high / low - 1):.2g} % in frequency, which "
+                         "shows no spectrum; should be 1")
+    if not low <= (1 + BEYOND) * subbands.reference_hz <= (1 + BEYOND) ** 2 * high:
+        raise ValueError(f"reffreq = '{grid.reffreq}' with nterms = {grid.nterms}: the data are at {low / 1e9:.5g} to "
+                         f"{high / 1e9:.5g} GHz, beyond which no spectrum is known; should be between these")
     listed = ", ".join(f"{freq / 1e9:.5g}" for freq in subbands.freqs_hz)
     log.info(f"nterms = {grid.nterms}: the sky is solved for at {listed} GHz, the model is that at "
              f"{subbands.reference_hz / 1e9:.5g} GHz")

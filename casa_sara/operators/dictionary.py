@@ -38,12 +38,13 @@ ORIENTATIONS = ("aa", "ad", "da", "dd")
 
 
 class Band(NamedTuple):
-    """Where one band lies: `coefs[band.slice]` is its 2-D array."""
+    """Where one band lies: `coefs[band.slice]` is its 2-D array; `order` is that of a spectrum, 0 its mean."""
 
     basis: int
     level: int
     orientation: str
-    slice: tuple[int, slice, slice]
+    slice: tuple[Any, ...]
+    order: int = 0
 
 
 class SaraDictionary:

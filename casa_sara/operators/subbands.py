@@ -281,7 +281,7 @@ class SubbandDictionary:
 
     def bands(self) -> list[Band]:
         """Return the list of all bands: `coefs[band.slice]` is the 2-D array of one."""
-        return [band._replace(slice=(order, *band.slice)) for order in range(len(self._orders))  # type: ignore[arg-type]
+        return [band._replace(slice=(order, *band.slice), order=order) for order in range(len(self._orders))
                 for band in self._dictionary.bands()]
 
     def analysis(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:

@@ -3,7 +3,7 @@
 from casa_sara.private.validation import Parameter
 
 SARACOMPARE = (
-    Parameter('models', ('string', 'stringVec'), '', 'Names of the products to compare, two or more', required=True),
+    Parameter('models', ('string', 'stringVec'), '', 'Names of the products to compare, two or more; one for features or inject', required=True),
     Parameter('names', ('string', 'stringVec'), [], 'Names of the products in the report; []: their file names'),
     Parameter('outdir', ('string',), '', "Folder for the report; '': none"),
     Parameter('vis', ('path', 'pathVec'), [], "Name of visibility file(s) to compare all models with; '': none", mustexist=True),
@@ -48,6 +48,9 @@ TSARA = (
     Parameter('stokes', ('string',), 'I', 'Stokes plane to make', allowed=('I', 'Q', 'U', 'V')),
     Parameter('projection', ('string',), 'SIN', 'Coordinate projection', allowed=('SIN',)),
     Parameter('startmodel', ('string',), '', 'Name of starting model image'),
+    Parameter('sdimage', ('string',), '', 'Input single dish image'),
+    Parameter('sdpsf', ('string',), '', 'Input single dish PSF image', opener='sdimage', open_unless=('',)),
+    Parameter('sdgain', ('double',), 1.0, 'A factor or gain to adjust single dish flux scale', opener='sdimage', open_unless=('',)),
     Parameter('specmode', ('string',), 'mfs', 'Spectral definition mode (mfs, cube)', allowed=('mfs', 'cube')),
     Parameter('reffreq', ('string',), '', 'Reference frequency', opener='specmode', open_on=('mfs',)),
     Parameter('spectralindex', ('string', 'double'), '', "Known spectral index of the sky: a number, or an image of it; '': flat", opener='specmode', open_on=('mfs',)),

@@ -177,7 +177,10 @@ def _solution(result, options, full):
         if solved.jackknife is not None:
             sara["jackknife"] = {"groups": solved.jackknife.asked, "made": len(solved.jackknife)}
         sara["reweightings"] = [dict(update) for update in record.reweightings]
-        sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds} for iteration, bounds in record.bounds]
+        blocks = len(result.blocks)  # without that of a single dish
+        sara["bounds"] = [{"iteration": iteration, "l2_bounds": bounds[:blocks]} for iteration, bounds in record.bounds]
+        if solved.total_power:
+            sara["total_power"] = dict(solved.total_power)
         if full:
             columns = ("iteration", "reweighting", "rel_change", "residual_norm", "model_flux", "model_max")
             sara["history"] = {name: np.array(getattr(record, name)) for name in columns}

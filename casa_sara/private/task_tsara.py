@@ -28,7 +28,17 @@ from casa_sara.casa.runtime.quantities import hertz, radians, seconds
 from casa_sara.imaging.continuum import make_image
 from casa_sara.imaging.cube import make_cube
 from casa_sara.imaging.dry_run import dry_run
-from casa_sara.options import Comparing, ImageGrid, ImagingRequest, Limits, Output, Selection, SolverOptions, Weighting
+from casa_sara.options import (
+    Comparing,
+    ImageGrid,
+    ImagingRequest,
+    Limits,
+    Output,
+    Selection,
+    SingleDish,
+    SolverOptions,
+    Weighting,
+)
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.private.launch import in_parallel
 from casa_sara.private.summary import cube_summary, summary
@@ -45,6 +55,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     """Run the task on validated parameters and return tclean's dictionary with a record `sara`."""
     _check_method(parameters)
     _refuse_for_mosaics(parameters)
+    _check_single_dish(parameters)
     _refuse_for_spectra(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
@@ -71,7 +82,8 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
-        result = make(ImagingRequest(selection, grid, weighting, options, output, limits),
+        dish = SingleDish(parameters["sdimage"], parameters["sdpsf"], parameters["sdgain"])
+        result = make(ImagingRequest(selection, grid, weighting, options, output, limits, dish),
                       lambda result: tell(result, options, full=True)["sara"], comm)
         if parameters["report"]:
             comm.once(_report, output.imagename, selection, options.nthreads, grid.is_cube)
@@ -194,6 +206,26 @@ def _refuse_for_mosaics(parameters):
                                 ("jackknife", False, "errors by jackknife are of single pointings only")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
+
+
+def _check_single_dish(parameters):
+    """Raise on parameters that do not go with a single dish."""
+    image = parameters["sdimage"]
+    if not parameters["sdgain"] > 0:
+        raise ValueError(f"sdgain = {parameters['sdgain']!r}: should be positive; 1 leaves the flux scale as it is")
+    if not image:
+        return
+    for name, right, reason in (("specmode", "mfs", "total power is for continuum images"),
+                                ("stokes", "I", "total power is of Stokes I"),
+                                ("method", "tsara", "the paper has no total power"),
+                                ("databound", "adapt", "the noise of sdimage is found, it has no weights"),
+                                ("spectralindex", "", "the sky has to be the same at all frequencies"),
+                                ("nterms", 1, "the sky has to be the same at all frequencies"),
+                                ("ndraws", 0, "its errors are not found by bootstrap"),
+                                ("jackknife", False, "its errors are not found by jackknife"),
+                                ("parallel", False, "total power takes one process")):
+        if parameters[name] != right:
+            raise ValueError(f"{name} = {parameters[name]!r} with sdimage = '{image}': {reason}; should be {right!r}")
 
 
 def _refuse_for_spectra(parameters):

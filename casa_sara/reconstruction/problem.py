@@ -6,6 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,12 @@ from casa_sara.data.outliers import find_wild
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
+from casa_sara.operators.single_dish import Stacked
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.total_power import Beside, TotalPower, WhitenedDish
 from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import NNLSFit, nnls
 
@@ -49,6 +52,8 @@ class Samples:
         Noise of each block measured from the data, in units of what the weights say; NaN where unknown.
     kept : int (M,)
         Numbers of the samples in the data given.
+    total_power : TotalPower, optional
+        What a single dish has measured, a block of its own after those of the samples.
     """
 
     data: Visibilities
@@ -56,6 +61,7 @@ class Samples:
     density: np.ndarray
     noise: np.ndarray | None = None
     kept: np.ndarray = field(default=None)  # type: ignore[arg-type]  # all of them: see below
+    total_power: TotalPower | None = None
 
     def __post_init__(self):
         self.offsets = np.asarray(self.offsets)
@@ -104,8 +110,9 @@ class Problem:
     """Whitened samples y = √w·V of this rank, the operators that belong to them, and the pixels that may be non-zero.
 
     `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
-    `samples` where that is None. `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image
-    times `sky_over_image`; with `subbands` the images of several frequencies are stacked.
+    `samples` where that is None; those of a single `dish`, where there is one, come after them, a block of their own.
+    `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image times `sky_over_image`; with
+    `subbands` the images of several frequencies are stacked.
     """
 
     samples: Samples
@@ -118,6 +125,7 @@ class Problem:
     support: np.ndarray | None = None
     averaged: Averaged | None = None
     sky_over_image: np.ndarray | None = None
+    dish: WhitenedDish | None = None
     subbands: Any = None
 
     @classmethod
@@ -158,7 +166,7 @@ class Problem:
         vis, offsets = data.vis * root_weight, samples.offsets
         measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy),
                                beam=data.beam)
-        precond = _preconditioner(samples, options.precondition, comm, grid.subbands)
+        precond = of_samples = _preconditioner(samples, options.precondition, comm, grid.subbands)
         averaged = None
         if options.averages and grid.mosaic is None:
             with suppress(OverflowError):  # hardly two samples share one of so many cells
@@ -170,6 +178,15 @@ class Problem:
             precond = averaged.weighted_mean(precond).astype(np.float32)
             root_weight = np.sqrt(averaged.sum_of_weights, dtype=np.float32, casting="same_kind")
             measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy))
+        dish = None
+        if samples.total_power is not None:
+            dish = samples.total_power.whitened(grid.shape, float(data.weight.sum(dtype=float)), unit_jy,
+                                                measurement.workers)
+            alone = float(prod(grid.shape))  # of one sample
+            of_dish = dish.precond(_norm_sq(samples, of_samples, grid, unit_jy) if options.precondition else alone)
+            measurement = Stacked(measurement, dish.operator)
+            vis, precond = np.concatenate([vis, dish.vis]), np.concatenate([precond, of_dish])
+            offsets = np.append(offsets, vis.size)
         if data_norm_sq is None:
             whole = Summed(measurement, comm)
             data_norm_sq = float(comm.bcast(power_method(
@@ -177,7 +194,18 @@ class Problem:
         if support is not None and grid.subbands is not None:
             support = np.tile(support, (grid.subbands.count, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
-                   grid.mosaic and grid.mosaic.over, grid.subbands)
+                   grid.mosaic and grid.mosaic.over, dish, grid.subbands)
+
+    @property
+    def renewing(self) -> Averaged | Beside | None:
+        """What makes the averages anew, None where there are none."""
+        return self.averaged if self.averaged is None or self.dish is None else Beside(self.averaged, self.dish.vis)
+
+    @property
+    def block_sizes(self) -> np.ndarray:
+        """Samples of each block on this rank, before they were averaged; int (d,)."""
+        sizes = np.diff(self.samples.offsets)
+        return sizes if self.dish is None else np.append(sizes, self.dish.vis.size)
 
     def flux_jy(self, image: np.ndarray) -> float:
         """Return Σ|I| of the sky of an image, which no visibility of it exceeds.
@@ -250,6 +278,7 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         problem = problem_of(samples, finer=finer)
         first, left = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
                            NNLSFit(positivity=options.positivity), stopped, problem.support)
+        left = left[: left.size - (0 if problem.dish is None else problem.dish.vis.size)]
         residual = left if problem.averaged is None else problem.averaged.residual(first)
         error = _averaging_error(problem, residual, left, comm)
         if error.max() > LARGEST_ERROR and finer.max() < MOST_HALVINGS and not stopped():
@@ -263,6 +292,8 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         samples, finer, rounds = samples.without(found.index), np.zeros_like(finer), rounds + 1
     left_out = np.setdiff1d(np.arange(everything), samples.kept)
     norms = _norms(residual, samples.offsets, comm)
+    if problem.dish is not None:
+        norms = np.append(norms, problem.dish.noise_norm(options.positivity, problem.support))
     return problem, Findings(left_out, wild, norms, problem.data_norm_sq, finer, float(error.max())), first
 
 
@@ -289,6 +320,13 @@ def _told_of_all(found, samples, layout, comm):
     """Return what is told of the wild samples of all ranks, in the order in which one rank alone has them."""
     numbered = zip(layout.numbers(samples.kept[found.index]).tolist(), found.named(samples.data))
     return [told for _, told in sorted(sum(comm.allgather(list(numbered)), []), key=lambda one: one[0])]
+
+
+def _norm_sq(samples, precond, grid, unit_jy):
+    """About ‖U^½Φ‖² of the visibilities, from what the samples of a uv cell have together, ΣUw, times the pixels."""
+    data = samples.data
+    of_cells = np.median(precond * samples.density * (data.weight / data.imaging_weight))
+    return float(of_cells) * prod(grid.shape) * unit_jy**2
 
 
 def _preconditioner(samples, wanted, comm, subbands=None):

@@ -96,12 +96,13 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     ------
     ValueError
         Noise levels that are neither one for all blocks nor one for each; too few blocks for a jackknife; errors
-        asked for of a mosaic, or with the paper's method.
+        asked for of a mosaic, or with the paper's method; total power with errors, with bounds that do not adapt, or
+        on several ranks.
     CheckpointError
         The state that was read is not one of these data.
     """
     comm, checkpoint = ranks.comm, control.checkpoint
-    _check(options, grid, len(samples.offsets) - 1)
+    _check(options, grid, samples, comm)
     flat = FlatNoise.of(samples.data, grid, comm)
     if flat is not None:
         grid, support, startmodel = flat.grid(grid), flat.support(support), flat.image(startmodel)
@@ -142,8 +143,11 @@ def _solve(solution, samples, averaging, options, control, layout, ranks):
         control.then(solution.ppd, solution.bounds, record)
 
 
-def _check(options, grid, blocks):
-    """Raise where options, image and number of blocks do not go together."""
+def _check(options, grid, samples, comm):
+    """Raise where options, image and data do not go together."""
+    blocks = len(samples.offsets) - 1
+    if samples.total_power is not None:
+        _check_total_power(options, comm)
     check_l2bound(options, blocks)
     if options.jackknife:
         jackknife_groups(blocks)
@@ -153,12 +157,21 @@ def _check(options, grid, blocks):
                          f"{what}, which has no errors of the model")
 
 
+def _check_total_power(options, comm):
+    """Raise where there cannot be a single dish beside the visibilities."""
+    wrong = dict(databound=options.databound != "adapt", method=options.method == PAPER, ndraws=options.ndraws > 0,
+                 jackknife=options.jackknife, parallel=comm.size > 1)
+    for name in (name for name, is_wrong in wrong.items() if is_wrong):
+        raise ValueError(f"{name} = {getattr(options, name, True)!r} is not possible with total power")
+
+
 def _averaging(solution, sides):
     """Return what is kept of the averaging, as of `Reconstruction`."""
     ppd, found = solution.ppd, solution.found
     if ppd.averaged is None:
         return {}
-    return dict(averages=int(ppd.block_sizes.sum()), cell_wavelengths=[float(sides[1]), float(sides[0])],
+    averages = int(ppd.block_sizes[:len(found.finer)].sum())
+    return dict(averages=averages, cell_wavelengths=[float(sides[1]), float(sides[0])],
                 halvings=found.finer.tolist(), largest_error=found.averaging_error)
 
 
@@ -168,7 +181,8 @@ def _averaging_words(ppd, averaging, options, grid, sides):
     if averaging:
         smaller = 2 ** max(averaging["halvings"])
         finer = f", or up to {smaller} times smaller" if smaller > 1 else ""
-        return (f"{ppd.samples.sum()} visibilities are averaged to {averaging['averages']} for the solver, within each "
+        count = ppd.samples[:len(averaging["halvings"])].sum()
+        return (f"{count} visibilities are averaged to {averaging['averages']} for the solver, within each "
                 f"block and {cell}{finer}; for the first image the averages are wrong by up to "
                 f"{averaging['largest_error']:.2g} of their noise, which is corrected at every re-weighting")
     if not options.averages:
@@ -189,7 +203,8 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     subbands = grid.subbands and grid.subbands.freqs_hz
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
         blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex, subbands=subbands,
-        sensitivity=grid.mosaic and grid.mosaic.over).items()}
+        sensitivity=grid.mosaic and grid.mosaic.over,
+        sdimage=samples.total_power and samples.total_power.values).items()}
     comm.once(checkpoint.identify, **digests)
 
 
@@ -235,11 +250,22 @@ def _result(solution, record, samples, averaging, comm, goes_on):
         record.stop_code = NOISE_ONLY
     model *= np.float32(unit_jy)
     subbands = solution.subbands
+    blocks = len(samples.offsets) - 1
+    total_power = {}
+    if solution.dish is not None:
+        whitened = dict(noise=bounds.l2_bounds, residual=ppd.residual_norms, alone=found.nnls_norms)
+        values = samples.total_power.values
+        brightest = float(np.abs(values).max())
+        total_power = dict(points=values.size, brightest_jy_per_beam=brightest) | {
+            f"{name}_jy_per_beam": float(norms[-1] / np.sqrt(2 * ppd.samples[-1]) / solution.dish.scale)
+            for name, norms in whitened.items()}
     return Reconstruction(
-        ppd.planes.at_reference(model), bounds.l2_bounds, ppd.residual_norms.copy(), found.nnls_norms, record,
+        ppd.planes.at_reference(model), bounds.l2_bounds[:blocks], ppd.residual_norms[:blocks].copy(),
+        found.nnls_norms[:blocks], record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
-        wild=found.wild, averaging=averaging, spectra=None if subbands is None else subbands.spectra(model),
+        wild=found.wild, averaging=averaging, total_power=total_power,
+        spectra=None if subbands is None else subbands.spectra(model),
         **{name: resampling.draws for name, resampling in resamplings.items()})
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,10 @@ class Reconstruction:
         `averages` to which these samples were averaged, `cell_wavelengths` (u, v) of the largest uv cells, `halvings`
         of each block's, and the `largest_error` of the averages of the first image in units of their noise; empty where
         they were not.
+    total_power : dict
+        Number of `points` of a single dish, the `brightest_jy_per_beam`, `noise_jy_per_beam` found of them, rms
+        `residual_jy_per_beam`, and `alone_jy_per_beam`, the noise from what an image of the dish alone leaves; empty
+        without one.
     draws, jackknife : Draws or None
         Of the bootstrap and of the jackknife, where asked for and the solution has come to an end.
     spectra : float32 (T, nx, ny) or None
@@ -57,6 +61,7 @@ class Reconstruction:
     kept: np.ndarray
     wild: list[dict]
     averaging: dict
+    total_power: dict = field(default_factory=dict)
     draws: Draws | None = None
     jackknife: Draws | None = None
     spectra: np.ndarray | None = None

@@ -77,7 +77,8 @@ def schedule_of(options: SolverOptions) -> Schedule | PaperSchedule:
 
 
 def bounds_of(ppd: AdaptivePPD, nnls_norms: np.ndarray, weight_sums: np.ndarray, noise: np.ndarray | None,
-              options: SolverOptions) -> AdaptiveBounds | GivenBounds | PaperBounds:
+              options: SolverOptions,
+              most: float | np.ndarray = np.inf) -> AdaptiveBounds | GivenBounds | PaperBounds:
     """Return the bounds of the blocks as `databound` asks for them.
 
     Parameters
@@ -92,6 +93,8 @@ def bounds_of(ppd: AdaptivePPD, nnls_norms: np.ndarray, weight_sums: np.ndarray,
         Noise of each block measured in the data, relative to the MS weights.
     options : SolverOptions
         Task parameters of the method.
+    most : float (d,)
+        Largest weight of each block relative to all others, where bounds adapt.
 
     Returns
     -------
@@ -109,5 +112,5 @@ def bounds_of(ppd: AdaptivePPD, nnls_norms: np.ndarray, weight_sums: np.ndarray,
     floor = ppd.residual_norms / DYNAMIC_RANGE
     if noise is not None:
         floor = np.fmax(floor, np.asarray(noise) * np.sqrt(2.0 * samples))
-    return AdaptiveBounds(nnls_norms, **common, floor=floor, rel_change=options.boundrelchange, tol=options.boundtol,
-                          step=options.boundstep, min_interval=options.boundinterval)
+    return AdaptiveBounds(nnls_norms, **common, floor=floor, most=most, rel_change=options.boundrelchange,
+                          tol=options.boundtol, step=options.boundstep, min_interval=options.boundinterval)

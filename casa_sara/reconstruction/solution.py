@@ -20,6 +20,7 @@ from casa_sara.reconstruction.paper_method import PAPER, block_norms, first_thre
 from casa_sara.reconstruction.problem import Findings, Problem, Samples, first_image
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import bounds_of
+from casa_sara.reconstruction.total_power import MOST, WhitenedDish
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperStage
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
@@ -44,6 +45,7 @@ class Solution:
     stage: Stage | PaperStage | None = None
     result: Reconstruction | None = None
     resamplings: dict[str, Bootstrap] = field(default_factory=dict)
+    dish: WhitenedDish | None = None
     subbands: Any = None
 
     @classmethod
@@ -77,15 +79,20 @@ class Solution:
         else:
             ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=ranks.comm)
-        ppd.unit_jy, ppd.averaged, ppd.sky_over_image = problem.unit_jy, problem.averaged, problem.sky_over_image
+        ppd.unit_jy, ppd.averaged, ppd.sky_over_image = problem.unit_jy, problem.renewing, problem.sky_over_image
         ppd.planes = planes
-        ppd.samples = ranks.comm.exscan(np.diff(samples.offsets))[1]
+        ppd.samples = ranks.comm.exscan(problem.block_sizes)[1]
         if problem.support is not None:
             ppd.confine(problem.support)
         weights = samples.data.weight * np.float32(problem.unit_jy**2)
-        weight_sums = ranks.comm.block_sums(weights, samples.offsets)
-        bounds = bounds_of(ppd, found.nnls_norms, weight_sums, samples.noise, options)
-        return cls(found, ppd, bounds, subbands=subbands)
+        weight_sums, noise, dish = ranks.comm.block_sums(weights, samples.offsets), samples.noise, problem.dish
+        most: float | np.ndarray = np.inf
+        if dish is not None:
+            most = np.append(np.full(weight_sums.size, np.inf), MOST)
+            weight_sums = np.append(weight_sums, dish.weight_sum)
+            noise = None if noise is None else np.append(noise, np.nan)
+        bounds = bounds_of(ppd, found.nnls_norms, weight_sums, noise, options, most)
+        return cls(found, ppd, bounds, dish=dish, subbands=subbands)
 
     def state(self, stage: Stage | PaperStage | None, layout: Layout, ranks: RankAssignment) -> dict[str, Any]:
         """Return, on rank 0, all that :func:`resume` needs beside data and parameters, as one rank alone has it.

@@ -12,7 +12,9 @@ __all__ = ["band_noise", "first_weights", "reweight"]
 
 SHRINK = 0.95  # of κ with every re-weighting: long steps first, fine ones at the end
 SLAB = 64  # lines squared at a time
+SAMPLES, MOST_DRAWS = 100_000, 16  # realisations of the noise have so many samples together, or are so many
 APPROXIMATIONS = 0.12  # of the prior on them within a support: they hold the flux, and little of the noise
+SLOPES = 2.0  # docs/decisions.md, "Unknown spectra"
 POINTS = 0.25  # of the prior, on sources that one point explains
 
 
@@ -20,9 +22,9 @@ def band_noise(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds,
                seed: int = 20180404) -> tuple[np.ndarray, float]:
     """Standard deviation of the noise in every band of the dictionary, and of a pixel, in the unit of the model.
 
-    One realisation of the noise, weighted by 1/σ_j² as the data are, is carried to the image and normalised by
-    the peak of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w; the array of the weights W serves as
-    scratch space, and so do those of `ppd`.
+    Realisations of the noise, weighted by 1/σ_j² as the data are, are carried to the image and normalised by the peak
+    of the point spread function, Ψ†Φ†Σ⁻¹n / Σ_j σ_j⁻² Σ w: one of many samples, several of few, which say less.  The
+    array of the weights W serves as scratch space, and so do those of `ppd`.
 
     Parameters
     ----------
@@ -40,19 +42,22 @@ def band_noise(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds,
     pixel : float
         Of a Dirac coefficient, which is a pixel divided by √(number of bases).
     """
-    rng = np.random.default_rng(seed)
-    noise = ppd.scratch_vis
-    draw_noise(ppd, rng, np.sqrt(bounds.noise_weights), noise)
-    image = ppd.adjoint(noise, ppd.scratch_image)
-    image /= image.dtype.type(bounds.total_weight)
-    coefs = ppd.dictionary.analysis(image, ppd.l1_weights)
-    bands = [_rms(coefs[band.slice]) for band in ppd.dictionary.bands()]
-    return np.maximum(bands, 1e-30), _rms(image) / np.sqrt(ppd.dictionary.n_bases)
+    rng, noise, dictionary = np.random.default_rng(seed), ppd.scratch_vis, ppd.dictionary
+    bands, pixel = np.zeros(len(dictionary.bands())), 0.0
+    draws = int(np.clip(SAMPLES // sum(ppd.block_sizes), 1, MOST_DRAWS))
+    for _ in range(draws):
+        draw_noise(ppd, rng, np.sqrt(bounds.noise_weights), noise)
+        image = ppd.adjoint(noise, ppd.scratch_image)
+        coefs = dictionary.analysis(image, ppd.l1_weights)
+        bands += [_mean_square(coefs[band.slice]) for band in dictionary.bands()]
+        pixel += _mean_square(image)
+    scale = bounds.total_weight * np.sqrt(draws)
+    return np.maximum(np.sqrt(bands) / scale, 1e-30), np.sqrt(pixel / dictionary.n_bases) / scale
 
 
-def _rms(values):
+def _mean_square(values):
     slabs = (values[start : start + SLAB] for start in range(0, len(values), SLAB))
-    return float(np.sqrt(sum(np.square(slab, dtype=float).sum() for slab in slabs) / values.size))
+    return float(sum(np.square(slab, dtype=float).sum() for slab in slabs) / values.size)
 
 
 def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confined: bool = False) -> None:
@@ -71,13 +76,16 @@ def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confin
         A support confines the model.
     """
     noise, pixel = band_noise(ppd, bounds)
-    for band, scale in zip(ppd.dictionary.bands(), _band_scales(noise, pixel) * _shares(ppd, confined)):
+    for band, scale in zip(ppd.dictionary.bands(), _band_scales(ppd, noise, pixel) * _shares(ppd, confined)):
         ppd.l1_weights[band.slice] = scale
 
 
-def _band_scales(noise, pixel):
-    """ν of every band."""
-    return np.maximum(noise / pixel, 1.0)
+def _band_scales(ppd, noise, pixel):
+    """ν of every band: of slopes and higher orders of spectra twice as much, as they are smaller than the mean."""
+    scales = np.maximum(noise / pixel, 1.0)
+    if ppd.planes.count > 1:
+        scales[[band.order > 0 for band in ppd.dictionary.bands()]] *= SLOPES
+    return scales
 
 
 def _shares(ppd, confined):
@@ -105,7 +113,7 @@ def reweight(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, scale: floa
         Whether the model is confined to what is significant.
     """
     noise, pixel = band_noise(ppd, bounds)
-    scales = _band_scales(noise, pixel)
+    scales = _band_scales(ppd, noise, pixel)
     alpha = scale * np.minimum(noise, pixel) / (scales if confined else 1.0)
     ppd.dictionary.reweight(ppd.model, alpha, scales * _shares(ppd, confined), ppd.l1_weights)
     if len(ppd.points):

@@ -12,6 +12,8 @@ from casa_sara.solver.adaptive_ppd import AdaptivePPD
 
 __all__ = ["AdaptiveBounds", "GivenBounds", "chi_square_bounds"]
 
+PATIENCE = 5  # times as long before a bound moves of a block that others cannot correct
+
 
 def chi_square_bounds(samples: np.ndarray, noise: npt.ArrayLike = 1.0) -> np.ndarray:
     """Bounds ε_j that hold the noise of each block with a margin of two standard deviations.
@@ -153,17 +155,20 @@ class AdaptiveBounds(_NoiseLevels):
 
     A bound moves as in the paper: when the model has settled (σ < γ1), at least P iterations after its last
     move, and when the residual differs by more than γ2, by the fraction γ3 of the way to the residual norm μ_j.
-    It never falls below `floor`.
+    It never falls below `floor`, nor to where a block would count for more than `most` allows.
 
     Parameters
     ----------
     floor : float (d,)
         Lowest bounds allowed.
+    most : float (d,)
+        Largest weight of each block, σ_j⁻² Σ w, relative to that of all others.
     rel_change, tol, step, min_interval
         γ1, γ2, γ3, P.
     """
 
     floor: np.ndarray | float = 0.0
+    most: np.ndarray | float = np.inf
     rel_change: float = 1e-2
     tol: float = 1e-2
     step: float = 0.618
@@ -173,6 +178,7 @@ class AdaptiveBounds(_NoiseLevels):
 
     def __post_init__(self):
         self.l2_bounds = np.maximum(self.l2_bounds, self.floor)
+        self.l2_bounds = np.maximum(self.l2_bounds, self._lowest())
         self._last_move = np.zeros(len(self.l2_bounds), int)
 
     def finish(self, ppd: AdaptivePPD) -> None:
@@ -198,10 +204,11 @@ class AdaptiveBounds(_NoiseLevels):
         """
         if ppd.rel_change >= self.rel_change:
             return False
-        move = (ppd.iteration - self._last_move >= self.min_interval) & self._off_target(ppd)
+        interval = np.where(np.isfinite(self.most), PATIENCE, 1) * self.min_interval
+        move = (ppd.iteration - self._last_move >= interval) & self._off_target(ppd)
         if not move.any():
             return False
-        target = np.maximum(ppd.residual_norms, self.floor)
+        target = np.maximum(ppd.residual_norms, self._lowest())
         self.l2_bounds = np.where(move, self.step * target + (1 - self.step) * self.l2_bounds, self.l2_bounds)
         self._last_move[move] = ppd.iteration
         self.apply_to(ppd)
@@ -225,4 +232,29 @@ class AdaptiveBounds(_NoiseLevels):
 
     def _off_target(self, ppd, slack=1.0):
         """Condition (iii): blocks whose residual norm, or floor, is further than slack × γ2 from the bound."""
-        return np.abs(np.maximum(ppd.residual_norms, self.floor) - self.l2_bounds) > slack * self.tol * self.l2_bounds
+        target = np.maximum(ppd.residual_norms, self._lowest())
+        # what few samples know of their own noise is 1/√(4M)
+        tol = np.where(np.isfinite(self.most), np.maximum(self.tol, 0.5 / np.sqrt(self.samples)), self.tol)
+        return np.abs(target - self.l2_bounds) > slack * tol * self.l2_bounds
+
+    def _lowest(self):
+        """The lowest bounds at the present noise of the other blocks."""
+        if not np.isfinite(self.most).any():
+            return self.floor
+        weights = self.weight_sums * self.noise_weights
+        others = weights.sum() - weights
+        return np.maximum(self.floor, np.sqrt(2.0 * self.samples * self.weight_sums / (self.most * others)))
+
+    def apply_to(self, ppd: AdaptivePPD) -> None:
+        """Hand the multipliers to the iteration, those of limited blocks for a prior as strong as their own noise.
+
+        Parameters
+        ----------
+        ppd : AdaptivePPD
+            Takes the multipliers, for its current κ.
+        """
+        super().apply_to(ppd)
+        if np.isfinite(self.most).any():
+            weights = self.weight_sums * self.noise_weights
+            own = np.sqrt((weights.sum() - weights) / weights)
+            ppd.penalise(ppd.multipliers * np.where(np.isfinite(self.most), own, 1.0))

@@ -151,7 +151,7 @@ class _saracompare:
         without it and new noise, in which nothing is there: 'p_value' is the probability that noise
         alone gives as much, from the scaled chi-square distribution of the draws, and 'sigma' the
         Gaussian with that tail; far beyond the draws both are extrapolated. 'rank_p_value' is what
-        the draws alone tell, at least 1/21. Needs vis; each region takes about ten times as long as
+        the draws alone tell, at least 1/21. Needs vis; each region takes about 15 times as long as
         the run. A region should hold the whole structure, and have been chosen before looking:
         otherwise multiply the p-value by the number of places that could have been chosen. Calibration
         errors count as far as they raise the noise found.

@@ -154,9 +154,33 @@ class _tsara:
         with its flux kept. It is in Jy/pixel, or in a unit that can be converted to it as mJy/pixel.
         Where the data constrain the sky it changes the time that the solver takes, not the result. On
         scales that no baseline measures, the result keeps part of it (from a quarter to all in
-        trials), so a single-dish image helps, but does not guarantee the total flux. For that,
-        feather .image afterwards.
+        trials), so a single-dish image helps, but does not guarantee the total flux: sdimage does.
         Example: startmodel='first.model'
+
+    sdimage : str, default ''
+        A single-dish image of the same sky, CASA's or a FITS file, which gives the total power and the
+        scales that the baselines do not measure. It is data, as the visibilities are: a block of its own,
+        whose noise is found as that of any block. It is in Jy/beam (or in K of the main beam, with beam and
+        frequency in its header), of one plane, on any grid and in any frame, and may be masked. It is used
+        where it and the image overlap, at points half a beam apart, but for a margin of 0.35 of its beam
+        along the edges of what is modelled: what the dish sees beyond the image is taken for empty, and
+        has to be less than a fifth of its beam. Its frequency must be within 2 per cent of that of the image.
+        The dish sees the sky itself. With gridder='mosaic' that is the model; else the model is the sky times
+        the primary beam, by which it is divided here, down to a tenth or to pblimit. .residual is of the
+        visibilities alone; .model and .image hold both.
+        The block counts as much as 3 per cent of the visibilities at most, whatever its noise.
+        Not available with it: specmode='cube', stokes other than 'I', method='dabbech2018', databound other
+        than 'adapt', spectralindex, ndraws, jackknife and parallel=True.
+        Example: sdimage='tp.image'
+
+    sdpsf : str, default ''
+        Opened by sdimage = other than ''.
+        An image of the beam of sdimage, 1 at its maximum, which is taken for the centre. '' takes the
+        Gaussian beam in the header of sdimage.
+
+    sdgain : float, default 1.0
+        Opened by sdimage = other than ''.
+        sdimage is multiplied by it.
 
     specmode : {'mfs', 'cube'}, default 'mfs'
         'mfs'   one continuum image of all selected channels. The sky is assumed to have the same
@@ -616,7 +640,8 @@ class _tsara:
       jackknife jackknife_error_jy), the largest S/N of the residual by width ('residual_snr'), the
       noise and bound of each block with its snapshot ('blocks'), to how many averages the
       visibilities were reduced for the solver, in uv cells of which size ('averaging', empty where
-      they were not), the history of re-weightings and iterations, the parameters that were
+      they were not), how many points of sdimage were used and the noise found of them in Jy/beam
+      ('total_power', where there is one), the history of re-weightings and iterations, the parameters that were
       chosen automatically and why, how many samples were left out for which reason ('dropped'), and
       the iterations from which the run was resumed ('resumed').
 
@@ -648,16 +673,17 @@ class _tsara:
     def __call__(
         self, vis='', selectdata=True, field='', spw='', timerange='', uvrange='', antenna='', scan='', observation='',
         intent='', datacolumn='corrected', imagename='', imsize=[100], cell=[], phasecenter='', stokes='I',
-        projection='SIN', startmodel='', specmode='mfs', reffreq='', spectralindex='', nterms=1, nchan=-1, start='',
-        width='', outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest', perchanweightdensity=True,
-        gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False, mosweight=True, pblimit=0.2,
-        weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True, restoringbeam=[], pbcor=False,
-        method='tsara', niter=100000, wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'],
-        wavelevels=4, usemask='user', mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt',
-        boundtol=0.01, boundrelchange=0.01, boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20,
-        reweightdecay=0.618, reweighttol=0.01, reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0,
-        ndraws=0, jackknife=False, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False,
-        report=False, restart=False, overwrite=False, savemodel='none', parallel=False,
+        projection='SIN', startmodel='', sdimage='', sdpsf='', sdgain=1.0, specmode='mfs', reffreq='', spectralindex='',
+        nterms=1, nchan=-1, start='', width='', outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest',
+        perchanweightdensity=True, gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False,
+        mosweight=True, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True,
+        restoringbeam=[], pbcor=False, method='tsara', niter=100000,
+        wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
+        mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
+        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
+        reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, ndraws=0, jackknife=False, blocks=0,
+        nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False,
+        overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())

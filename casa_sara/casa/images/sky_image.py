@@ -169,7 +169,7 @@ class SkyImage:
                                                         plane=plane)
 
 
-def read_sky_image(name, parameter, units):
+def read_sky_image(name, parameter, units, holes=False):
     """Read one image plane.
 
     Parameters
@@ -180,6 +180,8 @@ def read_sky_image(name, parameter, units):
         Task parameter that named it, for messages.
     units : sequence of str or None
         What is right here: out of 'Jy/pixel', 'Jy/beam', ''; units that can be converted to these are. None takes any.
+    holes : bool
+        Pixels may be masked, or not finite, and are NaN then; else the mask is not looked at.
 
     Returns
     -------
@@ -202,11 +204,14 @@ def read_sky_image(name, parameter, units):
                                  "channel")
             check_stokes_i(name, parameter, csys)
             pixels = read_pixels(ia)
+            if holes:
+                pixels[~read_pixels(ia, getmask=True) | ~np.isfinite(pixels)] = np.nan
     except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
     unit, factor = unit_in(units, name, parameter, given, csys)
     pixels *= np.float32(factor)
-    check_finite(name, parameter, pixels)
+    if not holes:
+        check_finite(name, parameter, pixels)
     return SkyImage(name, pixels, unit, beam_numbers(beam), SkyPlane(safe_record(csys), shape[:2]),
                     parameters_of(history))
 
