@@ -170,7 +170,7 @@ class _tsara:
         visibilities alone; .model and .image hold both.
         The block counts as much as 3 per cent of the visibilities at most, whatever its noise.
         Not available with it: specmode='cube', stokes other than 'I', method='dabbech2018', databound other
-        than 'adapt', spectralindex, ndraws, jackknife and parallel=True.
+        than 'adapt', spectralindex, nterms above 1, ndraws, jackknife and parallel=True.
         Example: sdimage='tp.image'
 
     sdpsf : str, default ''
