@@ -48,7 +48,7 @@ def iteration(case, nthreads, repeat):
     comm, (nx, ny, _, blocks, _) = world(), case
     uv, cell, image, _ = visibilities(case)
     volume = DataVolume(uv.shape[1], tuple(np.abs(uv).max(axis=1)))
-    ranks = assign_ranks(comm, volume, ImageGrid((nx, ny), (cell, cell)), SolverOptions())
+    ranks = assign_ranks(comm, volume, ImageGrid((nx, ny), (cell, cell)), SolverOptions(averaging=False))
     reader = ranks.reader(comm.rank)
     if reader is None:
         uv = uv[:, :0]
@@ -96,7 +96,7 @@ def modelled(case, found, ranks):
     """Seconds of the slowest rank by the table of costs, without the sum."""
     uv, cell, _, _ = visibilities(case)
     grid = ImageGrid(case[:2], (cell, cell))
-    fixed, shared = operator_costs(DataVolume(uv.shape[1], tuple(np.abs(uv).max(axis=1))), grid)
+    fixed, shared = operator_costs(DataVolume(uv.shape[1], tuple(np.abs(uv).max(axis=1))), grid, uv.shape[1])
     bases = basis_costs(SARA_BASES, case[:2])
     owners = np.array(found["owners"] or [0] * len(bases))
     readers = [rank * found["readers"] % ranks < found["readers"] for rank in range(ranks)]
@@ -140,7 +140,7 @@ def costs():
             operator = MeasurementOperator(uv, 1.0, shape, eps=1e-5)
             vis = operator.forward(image)
             seconds = _cpu(lambda: (operator.forward(image, vis), operator.adjoint(vis, out)))
-            table = operator_costs(DataVolume(size, (reach, reach)), ImageGrid(shape, (1.0, 1.0)))
+            table = operator_costs(DataVolume(size, (reach, reach)), ImageGrid(shape, (1.0, 1.0)), size)
             print(f"operator, reach {reach}, {size} visibilities: {seconds:.4f} s, table {sum(table):.4f} s")
 
 

@@ -42,7 +42,7 @@ PACKAGES = {
     "operators": {"numpy", "scipy", "finufft", "ducc0", "numba", "llvmlite", "pywt"},
     "data": {"numpy"},
     "parallel": {"numpy", "mpi4py"},
-    "runtime": {"numba"},
+    "runtime": {"numba", "numpy"},
     "analysis": {"numpy", "scipy", "astropy", "regions", "matplotlib", "jinja2", "PIL"},
 }
 

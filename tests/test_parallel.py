@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ import mpi_steps
 from casa_sara import tsara
 from casa_sara.casa.ms import read as ms_module
 from casa_sara.casa.ms.data_volume import DataVolume
-from casa_sara.imaging.load_balance import assign_ranks
+from casa_sara.imaging.load_balance import assign_ranks, solver_samples
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.mpi import LAUNCHED
 from casa_sara.parallel.serial import Serial
@@ -216,6 +217,19 @@ def test_work_is_shared_whole_and_evenly(size, samples):
     assert len(ranks.owners) == len(options.wavelets) and set(ranks.owners) <= set(range(size))
     # many visibilities spread over many ranks; few are not worth a second Fourier transform
     assert ranks.readers == 1 if samples == 100 else ranks.readers > size // 2
+
+
+def test_averages_are_counted_where_visibilities_are_averaged():
+    """For an image of few pixels a second reader would have nothing to do."""
+    volume, grid = DataVolume(1_000_000, (1e5, 1e5)), ImageGrid((512, 512), (1e-6, 1e-6))
+    every, few = (assign_ranks(_Ranks(8), volume, grid, SolverOptions(averaging=averaging)).readers
+                  for averaging in (False, True))
+    assert few < every
+    assert solver_samples(volume, grid, SolverOptions()) == 512**2
+    assert solver_samples(replace(volume, samples=1000), grid, SolverOptions()) == 500
+    for options in (SolverOptions(averaging=False), SolverOptions(method="dabbech2018")):
+        assert solver_samples(volume, grid, options) == 1_000_000
+    assert solver_samples(volume, replace(grid, gridder="mosaic"), SolverOptions()) == 1_000_000
 
 
 def test_what_does_not_fit_is_spread_further():

@@ -21,6 +21,7 @@ from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.subbands import SubbandDictionary, Subbands
 from casa_sara.options import Comparing, ImageGrid, Selection, SolverOptions
 from casa_sara.reconstruction.problem import Problem, Samples
+from casa_sara.runtime.scratch import IN_MEMORY
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.l1_weights import first_weights
 from casa_sara.solver.l2_bounds import AdaptiveBounds
@@ -96,7 +97,8 @@ def test_the_edges_of_the_band_slow_nothing_down(nterms):
     uvw = np.array([*baseline * freq_hz / 1e9 * [np.cos(turn := rng.uniform(0, 6.28, size)), np.sin(turn)],
                     np.zeros(size)])
     ones = np.ones(size, np.float32)
-    data = SimpleNamespace(vis=ones.astype(np.complex64), weight=ones, uvw=uvw, freq_hz=freq_hz, size=size, beam=None)
+    data = SimpleNamespace(vis=ones.astype(np.complex64), weight=ones, uvw=uvw, freq_hz=freq_hz, size=size, beam=None,
+                           scratch=IN_MEMORY)
     density = np.histogram2d(*uvw[:2], 32, [[-5e4, 5e4]] * 2)[0][tuple(np.floor((uvw[:2] + 5e4) / 3125).astype(int))]
     samples = Samples(data, np.array([0, size]), density)
     norms, options = [], SolverOptions(averaging=False)

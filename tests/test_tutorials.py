@@ -106,6 +106,21 @@ def test_compare_with_tclean(tmp_path):
 
 
 @pytest.mark.slow
+def test_line_cube(tmp_path):
+    module = tutorial("line_cube")
+    channels, measures = module.main(tmp_path)
+    ours = [channel["products"]["tsara"]["flux_jy"] for channel in measures["channels"]]
+    assert ours == pytest.approx(module.disc().sum(axis=(0, 1)), abs=0.01)
+    assert [channel["velocity_km_s"] for channel in measures["channels"]] == pytest.approx(module.channel_velocities(),
+                                                                                           abs=0.01)
+    lines = [measures["products"][name]["line_flux"] for name in ("tsara", "tclean")]
+    assert lines == pytest.approx([59.9, 58.9], abs=1.0)
+    module.draw(tmp_path / "line_cube.png", tmp_path)
+    assert drawn(tmp_path / "line_cube.png")
+    page_agrees("line_cube", module.as_text(channels, measures), rel=0.15)
+
+
+@pytest.mark.slow
 def test_total_power(tmp_path):
     module = tutorial("total_power")
     truth, models, results = module.main(tmp_path)

@@ -7,18 +7,45 @@ vanishes in the mean to first order, as the mean of δu does; what is left is �
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
 import numpy as np
 
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.runtime.scratch import IN_MEMORY, Scratch, slices
 
-__all__ = ["PHASE", "WORTHWHILE", "Averaged", "Cells", "cell_sides"]
+__all__ = ["PHASE", "WORTHWHILE", "Averaged", "Cells", "Lazy", "cell_sides"]
+
+
+class Sliced(Protocol):
+    """Numbers of all samples, of which slices can be taken: an array, or :class:`Lazy`."""
+
+    def __getitem__(self, piece: slice, /) -> np.ndarray:
+        """Return those of a slice."""
+
+
+@dataclass(frozen=True)
+class Lazy:
+    """Numbers of samples that are made when they are asked for.
+
+    Attributes
+    ----------
+    of : callable
+        Returns those of a slice.
+    """
+
+    of: Callable[[slice], np.ndarray]
+
+    def __getitem__(self, piece: slice, /) -> np.ndarray:
+        """Return those of a slice."""
+        return self.of(piece)
+
 
 PHASE = 0.1  # rad: rms within a full cell, of the phase of a source in the corner of the image
+SPARSE = 8  # cells of a block for each sample, above which samples are sorted rather than cells marked
 WORTHWHILE = 0.5  # of the samples: where there are more averages than that, all samples are used
 
 
@@ -57,16 +84,18 @@ class Cells:
 
     Parameters
     ----------
-    places : list of n float64 (M,)
+    places : list of n float64 (M,) or Lazy
         Of the samples; the first coordinate is v ≥ 0.
     sides : list of n float
         Of the cells.
     offsets : int (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1] of the samples.
     finer : int (d,)
-        The cells of block j are 2^finer[j] times smaller.
+        The cells of block j are 2^finer[j] times smaller, or larger where that is negative.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
+    scratch : Scratch
+        Where the samples are.
 
     Attributes
     ----------
@@ -79,16 +108,16 @@ class Cells:
         There are too many cells to number them.
     """
 
-    def __init__(self, places: Sequence[np.ndarray], sides: Sequence[float], offsets: np.ndarray, finer: np.ndarray,
-                 comm: Serial = SERIAL) -> None:
-        self._comm = comm
-        key, spans = _numbers(places, sides, offsets, finer, comm)
-        keys, self._cell = _distinct(key, offsets)
+    def __init__(self, places: Sequence[Sliced], sides: Sequence[float],
+                 offsets: np.ndarray, finer: np.ndarray, comm: Serial = SERIAL, scratch: Scratch = IN_MEMORY) -> None:
+        self._comm, self._scratch, self._of_samples = comm, scratch, offsets
+        lattice = _Lattice.of(places, sides, offsets, finer, comm, scratch)
+        keys, self._cell, self._first = _distinct(lattice, offsets)
         self._found = keys.size
         # rows of the largest cells go to ranks, from the lowest v to the highest
-        volume = int(np.prod(spans))
-        row = keys % volume // (volume // spans[0]) >> finer[keys // volume]
-        owner = _owners(row, key.size > 0, comm)
+        volume, spans = lattice.volume, lattice.spans
+        row = np.floor(keys % volume // (volume // spans[0]) / np.exp2(finer - finer.min())[keys // volume]).astype(int)
+        owner = _owners(row, self._cell.size > 0, comm)
         self._sent = [np.flatnonzero(owner == rank) for rank in range(comm.size)]
         everything, self._place = np.unique(self._exchanged(keys), return_inverse=True)
         self.offsets = np.searchsorted(everything, np.arange(len(offsets)) * volume)
@@ -98,19 +127,26 @@ class Cells:
         """Number of cells of this rank."""
         return int(self.offsets[-1])
 
-    def sums(self, values: np.ndarray) -> np.ndarray:
+    def pieces(self) -> Iterator[tuple[int, slice]]:
+        """Yield the block and the samples of each piece to work on: all at once (block −1) where they are in memory."""
+        return _pieces_of(self._of_samples, self._scratch)
+
+    def sums(self, values: Sliced) -> np.ndarray:
         """Return the sum of the values of the samples in every cell of this rank.
 
         Parameters
         ----------
-        values : real (M,)
+        values : real (M,) or Lazy
             Of the samples of this rank.
 
         Returns
         -------
         float64 (cells,)
         """
-        sums = np.bincount(self._cell, values, self._found)
+        sums = np.zeros(self._found)
+        for block, piece in self.pieces():
+            first, end = (0, self._found) if block < 0 else self._first[block : block + 2]
+            sums[first:end] += np.bincount(self._cell[piece] - first, values[piece], end - first)
         return np.bincount(self._place, self._exchanged(sums), self.size)
 
     def _exchanged(self, of_cells):
@@ -118,33 +154,94 @@ class Cells:
         return np.concatenate(self._comm.alltoall([of_cells[chosen] for chosen in self._sent]))
 
 
-def _numbers(places, sides, offsets, finer, comm):
-    """Return the number of each sample's cell, int64 (M,), by block and v first, and the cells along each axis."""
-    counts, spans = np.diff(offsets), []
-    key = np.repeat(np.arange(counts.size), counts)
-    for place, side in zip(places, sides):
-        number = np.repeat(np.exp2(finer) / side, counts)
-        number *= place
-        number = np.floor(number, out=number).astype(np.int64)
-        least = -comm.largest(int(-number.min(initial=0)))
-        spans.append(comm.largest(int(number.max(initial=0))) - least + 1)
-        key *= spans[-1]
-        key += number
-        key -= least
-    if counts.size * np.prod(spans, dtype=float) > 2.0**62:
-        raise OverflowError(f"{counts.size} blocks of {' x '.join(map(str, spans))} cells are too many to be numbered")
-    return key, spans
+def _pieces_of(offsets, scratch):
+    """Yield the block and the samples of each piece: each of one block, or of all (−1) where they are in memory."""
+    if not scratch.on_disk:
+        yield -1, slice(0, int(offsets[-1]))
+        return
+    for block, ends in enumerate(zip(offsets[:-1].tolist(), offsets[1:].tolist())):
+        for piece in scratch.pieces(*ends):
+            yield block, piece
 
 
-def _distinct(key, offsets):
-    """Return the distinct numbers of each block, one block after the other, and where among them each sample's is."""
-    keys, cell, count = [np.zeros(0, np.int64)], np.empty(key.size, np.int32), 0
-    for start, stop in zip(offsets[:-1], offsets[1:]):
-        found, inverse = np.unique(key[start:stop], return_inverse=True)
-        np.add(inverse, count, out=cell[start:stop], casting="same_kind")
+@dataclass
+class _Lattice:
+    """The cells of all blocks; `least` is the number of the first one along each axis, `spans` how many there are."""
+
+    places: Sequence[Sliced]
+    sides: Sequence[float]
+    offsets: np.ndarray
+    finer: np.ndarray
+    scratch: Scratch
+    least: list[int] = field(default_factory=list)
+    spans: list[int] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, places, sides, offsets, finer, comm, scratch):
+        """Find out how far the cells reach."""
+        lattice = cls(places, sides, offsets, finer, scratch)
+        for axis in range(len(places)):
+            ends = np.array([[-number.min(initial=0), number.max(initial=0)]
+                             for _, piece in _pieces_of(offsets, scratch)
+                             for number in [lattice.numbers(axis, piece)]]).max(axis=0)
+            lattice.least.append(-comm.largest(int(ends[0])))
+            lattice.spans.append(comm.largest(int(ends[1])) - lattice.least[-1] + 1)
+        if (len(offsets) - 1) * np.prod(lattice.spans, dtype=float) > 2.0**62:
+            spans = " x ".join(map(str, lattice.spans))
+            raise OverflowError(f"{len(offsets) - 1} blocks of {spans} cells are too many to be numbered")
+        return lattice
+
+    @property
+    def volume(self) -> int:
+        """Number of cells of a block, with and without samples."""
+        return int(np.prod(self.spans))
+
+    def numbers(self, axis, piece):
+        """Return the number of each sample's cell along an axis, int64."""
+        counts = np.diff(np.clip(self.offsets, piece.start, piece.stop))
+        number = np.repeat(np.exp2(self.finer) / self.sides[axis], counts)
+        number *= self.places[axis][piece]
+        return np.floor(number, out=number).astype(np.int64)
+
+    def keys(self, piece):
+        """Return the number of each sample's cell, int64, by block and v first."""
+        counts = np.diff(np.clip(self.offsets, piece.start, piece.stop))
+        key = np.repeat(np.arange(counts.size), counts)
+        for axis, (least, span) in enumerate(zip(self.least, self.spans)):
+            key *= span
+            key += self.numbers(axis, piece)
+            key -= least
+        return key
+
+
+def _distinct(lattice, offsets):
+    """Return the distinct cells, one block after the other, which of them each sample is in, and where blocks begin."""
+    scratch, size = lattice.scratch, int(offsets[-1])
+    key = scratch.empty(size, np.int64)
+    for _, piece in _pieces_of(offsets, scratch):
+        key[piece] = lattice.keys(piece)
+    keys, cell, first = [np.zeros(0, np.int64)], scratch.empty(size, np.int32), [0]
+    for block, (start, stop) in enumerate(zip(offsets[:-1].tolist(), offsets[1:].tolist())):
+        found = _found(key[start:stop], cell[start:stop], block * lattice.volume, lattice.volume)
+        cell[start:stop] += first[-1]
         keys.append(found)
-        count += found.size
-    return np.concatenate(keys), cell
+        first.append(first[-1] + found.size)
+        scratch.let_go()
+    return np.concatenate(keys), cell, np.array(first)
+
+
+def _found(key, number, least, volume):
+    """Return the distinct keys, sorted, which lie between `least` and `least` + `volume`; `number` receives places."""
+    if volume > SPARSE * key.size:
+        found, number[...] = np.unique(key, return_inverse=True)
+        return found
+    seen = np.zeros(volume, bool)
+    for piece in slices(0, key.size):
+        seen[key[piece] - least] = True
+    place = np.cumsum(seen, dtype=np.int32)
+    for piece in slices(0, key.size):
+        number[piece] = place[key[piece] - least] - 1
+    return least + np.flatnonzero(seen)
 
 
 def _owners(row, holds, comm):
@@ -172,16 +269,16 @@ class Averaged:
     Attributes
     ----------
     cells : Cells
-    weight : real (M,)
-        w of the samples of this rank.
-    fold : float32 (M,)
-        −1 where v < 0: those are averaged as the conjugate at (−u, −v, −w); else 1.
-    vis : complex (M,)
-        y.
+    data : Visibilities
+        The samples of this rank: `weight` is w; where v < 0 they are averaged as the conjugate at (−u, −v, −w).
+    vis : complex (M,) or None
+        y; None where it does not fit into memory, and is made of the data.
     offsets : int (d + 1,)
         Of the blocks of the samples.
     operator : object
-        Φ, of all samples of this rank: `forward`.
+        Φ, of all samples of this rank: `forward`; `adjoint` where cells are enlarged.
+    finer : int (d,)
+        Of :class:`Cells`.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
     sum_of_weights : float64 (cells,)
@@ -191,20 +288,21 @@ class Averaged:
     """
 
     cells: Cells
-    weight: np.ndarray
-    fold: np.ndarray
-    vis: np.ndarray
+    data: Visibilities
+    vis: np.ndarray | None
     offsets: np.ndarray
     operator: Any
+    finer: np.ndarray
     comm: Serial = SERIAL
 
     def __post_init__(self):
-        self.sum_of_weights = self.cells.sums(self.weight)
+        self.sum_of_weights = self.cells.sums(self.data.weight)
         self.samples = self.comm.exscan(np.diff(self.offsets))[1]
 
     @classmethod
-    def of(cls, data: Visibilities, offsets: np.ndarray, sides: np.ndarray, finer: np.ndarray | None, vis: np.ndarray,
-           operator: Any, comm: Serial = SERIAL) -> tuple[Averaged, np.ndarray, np.ndarray | None]:
+    def of(cls, data: Visibilities, offsets: np.ndarray, sides: np.ndarray, finer: np.ndarray,
+           vis: np.ndarray | None, operator: Any,
+           comm: Serial = SERIAL) -> tuple[Averaged, np.ndarray, np.ndarray | None]:
         """Average the samples of a problem.
 
         Parameters
@@ -215,8 +313,8 @@ class Averaged:
             Block j is the slice offsets[j]:offsets[j + 1].
         sides : float (4,)
             Of :func:`cell_sides`.
-        finer : int (d,) or None
-            The cells of block j are 2^finer[j] times smaller than these; None for 0.
+        finer : int (d,)
+            The cells of block j are 2^finer[j] times smaller than these.
         vis, operator, comm
             As of the class.
 
@@ -228,49 +326,67 @@ class Averaged:
         freq_hz : float64 (cells,) or None
             Geometric mean of the frequencies, where the samples have some.
         """
-        fold = np.where(data.uvw[1] < 0, np.float32(-1), np.float32(1))
-        places = [data.uvw[axis] * fold for axis in ((1, 0, 2) if np.isfinite(sides[2]) else (1, 0))]
-        if data.freq_hz is not None:
-            places.append(np.log(data.freq_hz, dtype=float))
-        finer = np.zeros(len(offsets) - 1, int) if finer is None else finer
-        chosen = [sides[0], sides[1], *sides[2:3][np.isfinite(sides[2:3])], *sides[3:][:data.freq_hz is not None]]
-        averaged = cls(Cells(places, chosen, offsets, finer, comm), data.weight, fold, vis, offsets, operator, comm)
+        places: list[Sliced] = [_place(data, axis) for axis in ((1, 0, 2) if np.isfinite(sides[2]) else (1, 0))]
+        freqs = data.freq_hz
+        if freqs is not None:
+            places.append(Lazy(lambda piece: np.log(freqs[piece], dtype=float)))
+        chosen = [sides[0], sides[1], *sides[2:3][np.isfinite(sides[2:3])], *sides[3:][:freqs is not None]]
+        cells = Cells(places, chosen, offsets, finer, comm, data.scratch)
+        averaged = cls(cells, data, vis, offsets, operator, finer, comm)
         v, u, *others = (averaged.weighted_mean(place) for place in places)
-        freq_hz = None if data.freq_hz is None else np.exp(others.pop())
+        freq_hz = None if freqs is None else np.exp(others.pop())
         return averaged, np.array([u, v, *(others or [np.zeros_like(u)])]), freq_hz
 
-    def weighted_mean(self, values: np.ndarray) -> np.ndarray:
+    def weighted_mean(self, values: Sliced) -> np.ndarray:
         """Return the weighted mean of the values of the samples in every cell.
 
         Parameters
         ----------
-        values : real (M,)
+        values : real (M,) or Lazy
             Of the samples of this rank.
 
         Returns
         -------
         float64 (cells,)
         """
-        return self.cells.sums(self.weight * values) / self.sum_of_weights
+        return self.cells.sums(Lazy(lambda piece: self.data.weight[piece] * values[piece])) / self.sum_of_weights
 
-    def whitened_mean(self, vis: np.ndarray) -> np.ndarray:
+    def whitened_mean(self, vis: Sliced) -> np.ndarray:
         """Return Σ√w·vis/√W of whitened samples, which is √W times the weighted mean of what they were before.
 
         Parameters
         ----------
-        vis : complex (M,)
+        vis : complex (M,) or Lazy
             Of the samples of this rank.
 
         Returns
         -------
         complex (cells,)
         """
-        root, norm = np.sqrt(self.weight), 1 / np.sqrt(self.sum_of_weights)
-        mean = np.empty(self.cells.size, vis.dtype)
-        mean.real = self.cells.sums(root * vis.real) * norm
-        root *= self.fold
-        mean.imag = self.cells.sums(root * vis.imag) * norm
+        weight, v, sums = self.data.weight, self.data.uvw[1], self.cells.sums
+        norm = 1 / np.sqrt(self.sum_of_weights)
+        mean = np.empty(self.cells.size, np.result_type(vis[:0]))
+        mean.real = sums(Lazy(lambda piece: np.sqrt(weight[piece]) * vis[piece].real)) * norm
+        mean.imag = sums(Lazy(lambda piece: np.sqrt(weight[piece]) * _fold(v[piece]) * vis[piece].imag)) * norm
         return mean
+
+    @property
+    def enlarged(self) -> bool:
+        """Whether cells of a block are larger than a phase of `PHASE` allows."""
+        return bool(self.finer.min() < 0)
+
+    @property
+    def costly(self) -> bool:
+        """Whether :meth:`renew` takes longer than many iterations."""
+        return self.data.scratch.on_disk
+
+    @property
+    def whitened(self) -> Any:
+        """y of the samples of this rank, of which slices can be taken."""
+        return Lazy(self._whiten) if self.vis is None else self.vis
+
+    def _whiten(self, piece):
+        return self.data.vis[piece] * np.sqrt(self.data.weight[piece])
 
     def residual(self, model: np.ndarray) -> np.ndarray:
         """Return y − Φx of all samples of this rank.
@@ -284,10 +400,32 @@ class Averaged:
         -------
         complex (M,)
         """
-        predicted = self.operator.forward(model)
-        return np.subtract(self.vis, predicted, out=predicted)
+        if self.vis is not None:
+            predicted = self.operator.forward(model)
+            return np.subtract(self.vis, predicted, out=predicted)
+        return self._residual_and_gradient(model, None)[0]
 
-    def renew(self, model: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    def _residual_and_gradient(self, model, multipliers):
+        """Return y − Φx and, where there are multipliers, Φ†λ(y − Φx), in one pass over what is on the disk."""
+        if self.vis is not None:
+            residual = self.residual(model)
+            return residual, None if multipliers is None else \
+                self.operator.adjoint(residual * self._of_samples(multipliers, residual))
+        residual = self.data.scratch.empty(self.data.size, np.complex64)
+        gradient = None if multipliers is None else np.zeros(model.shape)
+        for piece, operator in self.operator.pieces():
+            left = np.subtract(self.whitened[piece], operator.forward(model), out=residual[piece])
+            if multipliers is not None:
+                gradient += operator.adjoint(left * self._of_samples(multipliers, left, piece))  # used up
+        return residual, gradient
+
+    def _of_samples(self, multipliers, vis, piece=slice(None)):
+        """Return the multiplier of each sample of a slice, in the precision of `vis`."""
+        start, stop, _ = piece.indices(int(self.offsets[-1]))
+        return np.repeat(multipliers.astype(vis.real.dtype), np.diff(np.clip(self.offsets, start, stop)))
+
+    def renew(self, model: np.ndarray, predicted: np.ndarray,
+              multipliers: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
         """Turn Φ̄x into ȳ, so that the averages leave of this model what all samples leave of it.
 
         Parameters
@@ -296,16 +434,21 @@ class Averaged:
             x.
         predicted : complex (cells,)
             Φ̄x, which becomes Φ̄x + r̄.
+        multipliers : float (d,), optional
+            λ of each block, of which a gradient is wanted.
 
         Returns
         -------
-        float64 (d,)
-            The scatter of each block, of all ranks.
+        scatter : float64 (d,)
+            Of each block, of all ranks.
+        gradient : real (nx, ny) or None
+            Φ†λr of the samples of this rank.
         """
-        residual = self.residual(model)
+        residual, gradient = self._residual_and_gradient(model, multipliers)
         mean = self.whitened_mean(residual)
         predicted += mean
-        return np.maximum(self.comm.allreduce(_powers(residual, self.offsets) - _powers(mean, self.cells.offsets)), 0)
+        scatter = self.comm.allreduce(_powers(residual, self.offsets) - _powers(mean, self.cells.offsets))
+        return np.maximum(scatter, 0), gradient
 
     def error(self, residual: np.ndarray, of_averages: np.ndarray) -> np.ndarray:
         """Return how wrong Φ̄ is for a model: the rms, in each block, of Φ̄x less the average of Φx.
@@ -325,6 +468,16 @@ class Averaged:
         wrong = self.whitened_mean(residual) - of_averages
         powers, cells = self.comm.allreduce(np.array([_powers(wrong, self.cells.offsets), np.diff(self.cells.offsets)]))
         return np.sqrt(powers / (2 * np.maximum(cells, 1)))
+
+
+def _fold(v):
+    """Return −1 where v < 0, else 1, float32."""
+    return np.where(v < 0, np.float32(-1), np.float32(1))
+
+
+def _place(data, axis):
+    """Return what gives u, v or w of samples, or of their conjugates where v < 0."""
+    return Lazy(lambda piece: data.uvw[axis, piece] * _fold(data.uvw[1, piece]))
 
 
 def _powers(vis, offsets):

@@ -9,6 +9,7 @@ import numpy as np
 
 from casa_sara.data.visibilities import BlockInfo, Visibilities
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.runtime.scratch import slices
 
 __all__ = ["snapshot_blocks"]
 
@@ -60,14 +61,39 @@ def snapshot_blocks(visibilities: Visibilities, blocks: int = 0, group: np.ndarr
     if not 0 <= blocks <= size:
         raise ValueError(f"blocks = {blocks}: it takes 0 (automatic) or 1 to {size}, the number of visibilities")
     table, of_row = _integrations(visibilities, comm)
-    of_sample = of_row[visibilities.row]
+    of_samples = _OfSamples(of_row, visibilities)
     if group is not None:
-        block_of_sample = _blocks_of_groups(table, of_sample, group, comm)
+        block_of_sample = _blocks_of_groups(table, of_samples.all(), group, comm)
     elif blocks:
-        block_of_sample = _equal_blocks(table, of_sample, blocks, comm)
+        block_of_sample = _equal_blocks(table, of_samples, blocks, comm)
     else:
-        block_of_sample = _blocks_of_rows(table)[of_sample]
-    return block_of_sample, _block_infos(visibilities.ms_names, table, of_sample, block_of_sample, comm)
+        block_of_sample = _OfSamples(_blocks_of_rows(table)[of_row], visibilities).all()
+    return block_of_sample, _block_infos(visibilities.ms_names, table, of_samples, block_of_sample, comm)
+
+
+@dataclass
+class _OfSamples:
+    """What a number of each row, int (R,), is of the samples, which may be many."""
+
+    of_row: np.ndarray
+    visibilities: Visibilities
+
+    def pieces(self):
+        """Yield slices of the samples, and the numbers of these."""
+        for piece in slices(0, self.visibilities.size):
+            yield piece, self.of_row[self.visibilities.row[piece]]
+            self.visibilities.scratch.let_go()
+
+    def all(self):
+        """Return the numbers of all samples, int (M,)."""
+        numbers = np.empty(self.visibilities.size, self.of_row.dtype)
+        for piece, those in self.pieces():
+            numbers[piece] = those
+        return numbers
+
+    def counts(self, size):
+        """Return how many samples have each number, int64 (size,)."""
+        return sum((np.bincount(those, minlength=size) for _, those in self.pieces()), np.zeros(size, np.int64))
 
 
 @dataclass
@@ -86,7 +112,7 @@ def _integrations(visibilities, comm):
     """Return the integrations of all ranks, and the number (R,) of the one that each row of this rank belongs to."""
     rows = visibilities.rows
     own, of_row = _distinct([getattr(rows, name) for name in list(_Integrations.__dataclass_fields__)[:-1]])
-    samples = np.bincount(of_row[visibilities.row], minlength=own[0].size)
+    samples = _OfSamples(of_row, visibilities).counts(own[0].size)
     lists = [np.concatenate(every) for every in zip(*comm.allgather((*own, samples)))]
     whole, of_own = _distinct(lists[:-1])
     begin = sum(comm.allgather(own[0].size)[: comm.rank])
@@ -119,33 +145,43 @@ def _blocks_of_groups(table, of_sample, group, comm):
     return block_of_sample
 
 
-def _equal_blocks(table, of_sample, blocks, comm):
-    """Return the block int32 (M,) of every sample for a given number of blocks of equal size."""
-    place, sizes = _places_in_time(table, of_sample, comm)
-    if blocks < sizes.size:  # then they cross from one MeasurementSet to another
-        sizes = np.array([sizes.sum()])
-    shares = _shares(sizes, blocks)
-    ends = np.cumsum(sizes)
-    part = np.searchsorted(ends, place, "right")
-    along = (place - (ends - sizes)[part]) * shares[part] // sizes[part]
-    return ((np.cumsum(shares) - shares)[part] + along).astype(np.int32)
-
-
-def _places_in_time(table, of_sample, comm):
-    """Return the place int64 (M,) of every sample among those of all ranks, and the samples of each MeasurementSet.
+def _equal_blocks(table, of_samples, blocks, comm):
+    """Return the block int32 (M,) of every sample for a given number of blocks of equal size.
 
     They go along MeasurementSets and time; of the same moment those of rank 0 come first, then those of rank 1, …
     """
     (ms, _), of_integration = _distinct([table.ms, table.time])
-    moment = of_integration[of_sample]
-    own = np.bincount(moment, minlength=ms.size)
-    before, counts = comm.exscan(own)
-    first = np.cumsum(counts) - counts + before  # place of this rank's first sample of each moment
-    order = np.argsort(moment, kind="stable")
-    place = np.empty(order.size, np.int64)
-    place[order] = np.arange(order.size) + np.repeat(first - (np.cumsum(own) - own), own)
+    moments = _OfSamples(of_integration[of_samples.of_row], of_samples.visibilities)
+    before, counts = comm.exscan(moments.counts(ms.size))
+    place = np.cumsum(counts) - counts + before  # of this rank's next sample of each moment
     sizes = np.bincount(ms, counts).astype(np.int64)
-    return place, sizes[sizes > 0]
+    sizes = sizes[sizes > 0]
+    if blocks < sizes.size:  # then they cross from one MeasurementSet to another
+        sizes = np.array([sizes.sum()])
+    shares = _shares(sizes, blocks)
+    ends, block_of_sample = np.cumsum(sizes), np.empty(of_samples.visibilities.size, np.int32)
+    for piece, moment in moments.pieces():
+        places = _take_places(place, moment)
+        part = np.searchsorted(ends, places, "right")
+        along = (places - (ends - sizes)[part]) * shares[part] // sizes[part]
+        block_of_sample[piece] = (np.cumsum(shares) - shares)[part] + along
+    return block_of_sample
+
+
+def _take_places(place, moment):
+    """Return the place of every sample of some moments, int64 (n,), and count up the next `place` of each moment."""
+    own, order = np.bincount(moment, minlength=place.size), np.argsort(moment, kind="stable")
+    places = np.empty(order.size, np.int64)
+    places[order] = np.arange(order.size) + np.repeat(place - (np.cumsum(own) - own), own)
+    place += own
+    return places
+
+
+def _counted(numbers):
+    """Return the distinct numbers, sorted, and how many there are of each."""
+    first = np.flatnonzero(np.diff(numbers, prepend=-1))  # where another one begins
+    found, inverse = np.unique(numbers[first], return_inverse=True)
+    return found, np.bincount(inverse, np.diff(first, append=numbers.size), found.size)
 
 
 def _shares(sizes, blocks):
@@ -241,10 +277,12 @@ def _gap(spans, k):
     return spans[k + 1].start - spans[k].end if 0 <= k < len(spans) - 1 else np.inf
 
 
-def _block_infos(ms_names, rows, of_sample, block_of_sample, comm):
+def _block_infos(ms_names, rows, of_samples, block_of_sample, comm):
     """Describe every block."""
-    pairs, counts = np.unique(block_of_sample.astype(np.int64) * rows.time.size + of_sample, return_counts=True)
-    pairs, counts = (np.concatenate(every) for every in zip(*comm.allgather((pairs, counts))))
+    found = [_counted(block_of_sample[piece] * np.int64(rows.time.size) + of_piece)
+             for piece, of_piece in of_samples.pieces()]
+    found = sum(comm.allgather(found), [])
+    pairs, counts = (np.concatenate(every) for every in zip(*found))
     samples = np.bincount(pairs // rows.time.size, counts)
     pairs = np.unique(pairs)
     first = np.searchsorted(pairs, np.arange(samples.size + 1) * rows.time.size)

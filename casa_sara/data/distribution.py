@@ -153,7 +153,7 @@ def series_with(data: Visibilities, residual: np.ndarray, suspect: np.ndarray,
     """Return (data, residual, suspect) that hold the series of all samples `suspect` from the first to the last.
 
     A series is what one baseline and channel have seen.  One rank alone has them all; of several each is given those of
-    its own suspects, and of the others'.
+    its own suspects, and of the others'.  Of data on the disk those of the suspects are taken.
 
     Parameters
     ----------
@@ -173,14 +173,15 @@ def series_with(data: Visibilities, residual: np.ndarray, suspect: np.ndarray,
     suspect : int (n,)
         The same samples among those.
     """
-    if comm.size == 1:
+    if comm.size == 1 and not data.scratch.on_disk:
         return data, residual, suspect
     of_row = np.stack([getattr(data.rows, name).astype(np.int64) for name in SERIES], axis=1)
     own = np.column_stack([of_row[data.row[suspect]], data.chan[suspect].astype(np.int64)])
     wanted = np.concatenate(comm.allgather(np.unique(own, axis=0)))
     if len(wanted) == 0:
         return data, residual, suspect
-    chosen = np.flatnonzero(_is_of(wanted, of_row, data.row, data.chan))
+    chosen = np.concatenate([piece.start + np.flatnonzero(_is_of(wanted, of_row, data.row[piece], data.chan[piece]))
+                             for piece in data.scratch.pieces(0, data.size)])
     parts, residuals = zip(*comm.allgather((data.part(chosen), residual[chosen])))
     begin = sum(part.size for part in parts[: comm.rank])
     return _joined(parts), np.concatenate(residuals), begin + np.searchsorted(chosen, suspect)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from casa_sara.data.distribution import by_baseline
 from casa_sara.data.visibilities import RowTable, Visibilities
 from casa_sara.data.weight_levels import levels
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.runtime.scratch import IN_MEMORY
 
 __all__ = ["MEDIAN_TO_SIGMA", "noise_from_differences", "series_of_rows"]
 
 FEWEST_DIFFERENCES = 20
+MOST_SAMPLES = 2_000_000  # of a block on the disk; of more, some baselines and channels are looked at
 MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
 
 
@@ -69,6 +73,8 @@ def series_of_rows(rows: RowTable) -> np.ndarray:
 
 def _block_noise(visibilities, block, series, comm):
     """Return the noise of one block, or NaN."""
+    if visibilities.scratch.on_disk:
+        visibilities, block = _some_series(visibilities, block, series), slice(None)
     row, chan = visibilities.row[block], visibilities.chan[block]
     key = series[row] * (int(chan.max(initial=0)) + 1) + chan
     time = visibilities.rows.time[row]
@@ -89,6 +95,18 @@ def _block_noise(visibilities, block, series, comm):
         found.append((comm.total(np.count_nonzero(here)), found[-1][1] if found and np.isnan(noise) else noise))
     sizes, noises = np.array(found).T
     return noises[0] if count == 1 else float(np.sqrt(np.average(np.square(noises), weights=sizes)))
+
+
+def _some_series(visibilities, block, series):
+    """Return the samples of a block, in memory; of a large one those of some baselines and channels."""
+    step, chosen = -(-(block.stop - block.start) // MOST_SAMPLES), []
+    for piece in visibilities.scratch.pieces(block.start, block.stop):
+        number = series[visibilities.row[piece]] + visibilities.chan[piece]
+        chosen.append(piece.start + np.flatnonzero(number % step == 0))
+    index = np.concatenate(chosen or [np.zeros(0, int)])
+    light = replace(visibilities, uvw=visibilities.uvw[:0], imaging_weight=visibilities.imaging_weight[None][:0],
+                    freq_hz=None, scratch=IN_MEMORY)
+    return light.take(index)
 
 
 def _noise_of_pairs(vis, variance, next_one, comm):

@@ -91,22 +91,31 @@ def find_wild(data: Visibilities, offsets: np.ndarray, residual: np.ndarray, flu
     -------
     WildSamples
     """
-    size = np.abs(residual)
-    scale = np.empty_like(size)
-    for start, stop in zip(offsets[:-1], offsets[1:]):
-        level, count = levels(data.weight[start:stop], comm)
-        for number in range(count):
-            here = slice(start, stop) if count == 1 else start + np.flatnonzero(level == number)
-            scale[here] = MEDIAN_TO_SIGMA * comm.median(np.abs([residual[here].real, residual[here].imag]))
-    predicted = np.abs(data.vis - residual / np.sqrt(data.weight))
-    suspect = np.flatnonzero((size > SIGNIFICANT * scale) & (size > predicted * np.sqrt(data.weight)))
+    found = [_suspects(data, slice(start, stop), residual, comm) for start, stop in zip(offsets[:-1], offsets[1:])]
+    suspect, size, predicted = (np.concatenate(parts) for parts in zip(*found))
     impossible = np.abs(data.vis[suspect]) > IMPOSSIBLE * flux_jy
-    wild = suspect[impossible | _alone(*series_with(data, residual, suspect, comm))]
+    chosen = impossible | _alone(*series_with(data, residual, suspect, comm))
+    wild, size, predicted = suspect[chosen], size[chosen], predicted[chosen]
     counted = data.weight >= comm.largest(data.weight[wild].max(initial=0)) / APART
     if comm.total(wild.size) > MOST * comm.total(int(np.count_nonzero(counted))):
-        wild = wild[:0]
-    wild = wild[size[wild] >= COMPARABLE * comm.largest(size[wild].max(initial=0))]
-    return WildSamples(wild, np.abs(data.vis[wild]), predicted[wild])
+        wild, size, predicted = wild[:0], size[:0], predicted[:0]
+    near = size >= COMPARABLE * comm.largest(size.max(initial=0))
+    return WildSamples(wild[near], np.abs(data.vis[wild[near]]), predicted[near])
+
+
+def _suspects(data, block, residual, comm):
+    """Return the samples of a block with large residuals, the sizes of these, and what the image predicts for them."""
+    size, weight = np.abs(residual[block]), data.weight[block]
+    scale = np.empty_like(size)
+    level, count = levels(weight, comm)
+    for number in range(count):
+        here = slice(None) if count == 1 else np.flatnonzero(level == number)
+        left = residual[block][here]
+        scale[here] = MEDIAN_TO_SIGMA * comm.median(np.abs([left.real, left.imag]))
+    predicted = np.abs(data.vis[block] - residual[block] / np.sqrt(weight))
+    suspect = np.flatnonzero((size > SIGNIFICANT * scale) & (size > predicted * np.sqrt(weight)))
+    data.scratch.let_go()
+    return block.start + suspect, size[suspect], predicted[suspect]
 
 
 def _alone(data, residual, suspect):

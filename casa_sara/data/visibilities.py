@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+
+from casa_sara.runtime.scratch import IN_MEMORY, Scratch, slices
 
 __all__ = ["BlockInfo", "RowTable", "Visibilities", "clock", "sort_into_blocks"]
 
@@ -76,6 +79,8 @@ class Visibilities:
         (number of the MeasurementSet, number of the field) → its direction, a CASA direction measure.
     mixed_weights : bool
         Whether some rows of a MeasurementSet have a WEIGHT_SPECTRUM and others have not.
+    scratch : Scratch
+        Where the arrays of samples are, and others of their size go.
     """
 
     vis: np.ndarray
@@ -97,6 +102,7 @@ class Visibilities:
     beam: np.ndarray | None = None
     fields: dict[tuple[int, int], dict] = field(default_factory=dict)
     mixed_weights: bool = False
+    scratch: Scratch = IN_MEMORY
 
     @property
     def size(self) -> int:
@@ -115,10 +121,20 @@ class Visibilities:
         -------
         Visibilities
         """
-        per_sample = ["vis", "weight", "imaging_weight", "uvw", "row", "chan"]
-        per_sample += [name for name in ("freq_hz", "beam") if getattr(self, name) is not None]
-        taken: dict[str, Any] = {name: np.take(getattr(self, name), index, axis=-1) for name in per_sample}
-        return replace(self, **taken)
+        scratch = self.scratch if len(index) > self.scratch.piece else IN_MEMORY
+        taken: dict[str, Any] = {name: _taken(column, index, scratch) for name, column in self._columns().items()}
+        return replace(self, **taken, scratch=scratch)
+
+    def _columns(self):
+        """Return name → array of what there is of each sample."""
+        names = ("vis", "weight", "imaging_weight", "uvw", "row", "chan", "freq_hz", "beam")
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+    def parts(self) -> Iterator[tuple[slice, Visibilities]]:
+        """Yield slices of the samples, as many as are worked on at a time, and these; `rows` stays whole."""
+        for piece in self.scratch.pieces(0, self.size):
+            columns = {name: column[..., piece] for name, column in self._columns().items()}
+            yield piece, replace(self, **columns, scratch=IN_MEMORY)
 
     def part(self, index: np.ndarray) -> Visibilities:
         """Return the samples numbered `index`, in that order, with `rows` of their own.
@@ -133,25 +149,51 @@ class Visibilities:
         Visibilities
         """
         chosen = self.take(index)
-        used, row = np.unique(chosen.row, return_inverse=True)
-        chosen.row = row.astype(np.int32)
+        used = np.zeros(self.rows.row.size, bool)
+        used[chosen.row] = True
+        chosen.row = (np.cumsum(used) - 1).astype(np.int32)[chosen.row]
         chosen.rows = RowTable(**{name: column[used] for name, column in vars(self.rows).items()})
         return chosen
 
     @property
     def max_uv(self) -> float:
         """Longest projected baseline in wavelengths."""
-        return float(np.sqrt(np.max(self.uvw[0] ** 2 + self.uvw[1] ** 2, initial=0)))
+        return max((float(np.sqrt(np.max(square))) for square in self._uv_squares()), default=0.0)
 
     @property
     def min_uv(self) -> float:
         """Shortest projected baseline in wavelengths."""
-        return float(np.sqrt(np.min(self.uvw[0] ** 2 + self.uvw[1] ** 2, initial=np.inf)))
+        return min((float(np.sqrt(np.min(square))) for square in self._uv_squares()), default=np.inf)
+
+    def _uv_squares(self):
+        """Yield u² + v² of some samples after the other."""
+        for piece in slices(0, self.size):
+            yield self.uvw[0, piece] ** 2 + self.uvw[1, piece] ** 2
+            self.scratch.let_go()
+
+    @property
+    def reach(self) -> tuple[float, float, float]:
+        """Largest |u|, |v| and |w| in wavelengths."""
+        reach = np.zeros(3)
+        for piece in self.scratch.pieces(0, self.size):
+            np.maximum(reach, [np.abs(axis[piece]).max(initial=0) for axis in self.uvw], out=reach)
+        u, v, w = reach.tolist()
+        return u, v, w
 
     @property
     def max_w(self) -> float:
         """Largest |w| in wavelengths."""
-        return float(np.max(np.abs(self.uvw[2]), initial=0))
+        return self.reach[2]
+
+
+def _taken(column, index, scratch):
+    """Return the samples numbered `index` of a column."""
+    if not scratch.on_disk:
+        return np.take(column, index, axis=-1)
+    taken = scratch.empty((*column.shape[:-1], len(index)), column.dtype)
+    for piece in scratch.pieces(0, len(index)):
+        taken[..., piece] = np.take(column, index[piece], axis=-1)
+    return taken
 
 
 @dataclass(frozen=True)
@@ -211,6 +253,7 @@ def sort_into_blocks(visibilities: Visibilities, block_of_sample: np.ndarray,
     offsets : int64 (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1].
     """
-    order = np.argsort(block_of_sample, kind="stable")
     offsets = np.concatenate([[0], np.cumsum(np.bincount(block_of_sample, minlength=blocks))]).astype(np.int64)
-    return visibilities.take(order), offsets
+    if visibilities.scratch.on_disk and np.all(block_of_sample[1:] >= block_of_sample[:-1]):
+        return visibilities, offsets
+    return visibilities.take(np.argsort(block_of_sample, kind="stable")), offsets

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.runtime.scratch import slices
 
 __all__ = ["APART", "gaps", "levels"]
 
@@ -40,7 +41,9 @@ def gaps(weight: np.ndarray, factor: float, comm: Serial = SERIAL) -> tuple[np.n
     lightest, heaviest = -comm.largest(-weight.min(initial=np.inf)), comm.largest(weight.max(initial=0.0))
     if not heaviest > factor * lightest:
         return np.zeros(0), np.zeros(0)
-    counts = comm.allreduce(np.bincount(np.floor(10 * np.log10(weight)).astype(int) + _TENTHS, minlength=2 * _TENTHS))
+    counts = comm.allreduce(sum(
+        (np.bincount(np.floor(10 * np.log10(weight[some])).astype(int) + _TENTHS, minlength=2 * _TENTHS)
+         for some in slices(0, weight.size)), np.zeros(2 * _TENTHS, np.int64)))
     held = np.flatnonzero(counts)
     below = np.flatnonzero(np.diff(held) > 10 * math.log10(factor))
     middle = 10 ** (((held[below] + held[below + 1] + 1) / 2 - _TENTHS) / 10)

@@ -32,7 +32,7 @@ from casa_sara.imaging.data_quality import (
     suspects,
     thermal_noise,
 )
-from casa_sara.imaging.dry_run import forecast_run
+from casa_sara.imaging.dry_run import forecast_run, scratch_of
 from casa_sara.imaging.error_images import error_images
 from casa_sara.imaging.island_list import list_islands
 from casa_sara.imaging.mosaic import check_pointings, weight_image, with_beams
@@ -130,14 +130,15 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
         For data or parameters that no image can be made of; the message names the task parameter.
     """
     output, deadline = request.output, Deadline(request.limits.maxtime_s)
-    forecast, ranks = forecast_run(request.selection, request.grid, request.options, request.limits, comm)
+    forecast, ranks = forecast_run(request.selection, request.grid, request.options, request.limits, comm,
+                                   output.blocks, disk=not request.single_dish.image)
     comm.together(forecast.require, request.limits.maxmem_gb)
     checkpoint = checkpoint_of(request)
     if output.resume:
         comm.once(checkpoint.open)
     with waiting_child(write_images) if comm.rank == 0 else nullcontext() as child:  # it starts while CASA reads
         with kernels_loading(log.info):
-            data, plane = _read(request, ranks)
+            data, plane = _read(request, ranks, scratch_of(output.imagename, forecast.workload))
         if output.images_stand:
             return _complete(request, plane, data, forecast, comm)
         part = split(data, output.blocks, comm, plane.grid.subbands)
@@ -195,11 +196,11 @@ class _Solution:
                       images.model_flux, forecast.summary(), doubtful, subbands)
 
 
-def _read(request, ranks):
+def _read(request, ranks, scratch):
     """Return this rank's visibilities, and the plane of the image with its first model and support."""
     grid, output, comm = request.grid, request.output, ranks.comm
     frequencies = grid.needs_frequencies
-    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks)
+    data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks, scratch)
     data.notes.extend(check_pointings(data, grid))
     if grid.is_mosaic:
         data, grid = with_beams(data, request.selection, grid)

@@ -60,8 +60,12 @@ def thermal_noise(data, weights, noise, offsets, comm=SERIAL):
     -------
     float
     """
-    level = np.repeat(np.where(np.isfinite(noise), noise, 1.0), np.diff(offsets))
-    power = comm.total(float(np.sum((weights * level) ** 2 / data.weight, dtype=float)))
+    power = 0.0
+    for piece in data.scratch.pieces(0, data.size):
+        counts = np.diff(np.clip(offsets, piece.start, piece.stop))
+        level = np.repeat(np.where(np.isfinite(noise), noise, 1.0), counts)
+        power += float(np.sum((weights[piece] * level) ** 2 / data.weight[piece], dtype=float))
+    power = comm.total(power)
     return float(np.sqrt(power) / comm.total(float(weights.sum(dtype=float))))
 
 
@@ -188,7 +192,7 @@ def beyond_baselines(model, cell_rad, shortest):
 def image_limits(data, grid, comm=SERIAL):
     """Return warnings about this image plane and these baselines; raise where no image can be made of them."""
     notes = []
-    reach = [[comm.largest(float(np.abs(axis).max(initial=0)))] for axis in data.uvw[:2]]
+    reach = [[comm.largest(longest)] for longest in data.reach[:2]]
     max_uv, max_w = comm.largest(data.max_uv), comm.largest(data.max_w)
     check_cell(np.array(reach), grid.cell_rad)
     check_field(max_uv, grid.shape, grid.cell_rad)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from dataclasses import replace
 
@@ -27,16 +28,21 @@ from casa_sara.parallel.partition import ALONE
 from casa_sara.parallel.serial import SERIAL
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.runtime.machine import available_memory, resident_memory
+from casa_sara.runtime.scratch import IN_MEMORY, Scratch
 
-__all__ = ["forecast_run", "dry_run"]
+__all__ = ["dry_run", "forecast_run", "scratch_of"]
 
+MANY = 30_000_000  # samples, which are kept on the disk even if there is memory
+LEAST = 1_000_000  # samples that go there where memory is short: with fewer it is the image that does not fit
+DISK_SAMPLE = 102  # bytes of a sample there: 46 of it, 28 of the operator, 12 of its cell, residual, density, weights
 WRITER = 130_000_000  # bytes of the process that writes the images, while it waits
 
 
-def forecast_run(selection, grid, options, limits, comm=SERIAL):
+def forecast_run(selection, grid, options, limits, comm=SERIAL, blocks=0, disk=True):
     """Share a run among the ranks, and forecast the memory of this one, from the numbers of rows, channels and pixels.
 
-    Rank 0 says its own in the log. Flags are read only where the run would not fit with all samples.
+    Rank 0 says its own in the log. Flags are read only where the run would not fit with all samples. Many samples, and
+    those that do not fit into memory, are kept on the disk where that can be.
 
     Returns
     -------
@@ -58,11 +64,48 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL):
         ranks = ALONE if grid.is_cube else assign_ranks(  # each rank has its channels, and reads all
             comm, volume, grid, options, lambda ranks: all(comm.allgather(memory_of(ranks).fits)))
         found = memory_of(ranks)
+        if (disk and _may_be_on_disk(grid, options, limits, comm)
+                and (volume.samples >= MANY or volume.samples >= LEAST and not found.fits)):
+            work = replace(found.workload, on_disk=True, blocks=blocks if isinstance(blocks, int) else 0)
+            found = forecast(work, resident, available, limits.maxmem_gb)
         if all(comm.allgather(found.fits)):
             break
     for line in found.lines():
         log.info(line)
     return found, ranks
+
+
+def _may_be_on_disk(grid, options, limits, comm):
+    """Whether samples can be kept on the disk: those of one image that are averaged for the solver, of one process.
+
+    The report has all of them in memory.
+    """
+    return (comm.size == 1 and not grid.is_cube and not grid.is_mosaic and grid.nterms == 1 and not limits.report
+            and (options.averages or options.niter == 0))
+
+
+def scratch_of(imagename, workload):
+    """Return where the samples of a run go.
+
+    Parameters
+    ----------
+    imagename : str
+        Whose folder it is.
+    workload : casa_sara.imaging.memory_forecast.Workload
+        Whether they go to the disk.
+
+    Raises
+    ------
+    OSError
+        There they have no room.
+    """
+    if not workload.on_disk:
+        return IN_MEMORY
+    scratch = Scratch(os.path.dirname(imagename) or os.curdir)
+    scratch.require(DISK_SAMPLE * workload.samples)
+    log.info(f"visibilities and what belongs to each, {DISK_SAMPLE * workload.samples / 1e9:.3g} GB, are kept in files "
+             f"without a name in '{scratch.folder}'")
+    return scratch
 
 
 def _channels(selection, grid):
@@ -85,7 +128,7 @@ def _fullest_channel(data, selection, grid):
     return data.part(np.flatnonzero(channel == count.argmax()))
 
 
-def dry_run(selection, grid, options, blocks, limits):
+def dry_run(selection, grid, options, output, limits):
     """Forecast the memory of a run by part and, where it fits, its time from a short measurement.
 
     Nothing is written.
@@ -94,8 +137,8 @@ def dry_run(selection, grid, options, blocks, limits):
     ----------
     selection, grid, options
         As of :func:`casa_sara.imaging.continuum.make_image`.
-    blocks : int or tuple of str
-        As of :class:`casa_sara.options.Output`.
+    output : casa_sara.options.Output
+        Its `blocks` and, where visibilities go to the disk, the folder of its `imagename`.
     limits : casa_sara.options.Limits
         Largest memory.
 
@@ -106,7 +149,7 @@ def dry_run(selection, grid, options, blocks, limits):
         `reason` instead where it does not fit.
     """
     with kernels_loading(log.info):
-        found, _ = forecast_run(selection, grid, options, limits)
+        found, _ = forecast_run(selection, grid, options, limits, blocks=output.blocks)
     if not found.fits:
         try:
             found.require(limits.maxmem_gb)
@@ -114,7 +157,8 @@ def dry_run(selection, grid, options, blocks, limits):
             log.warn(str(error))
             return found.summary() | {"reason": str(error)}
     start = time.perf_counter()
-    data = read_visibilities(selection, grid.phasecenter, grid.stokes, grid.needs_frequencies)
+    data = read_visibilities(selection, grid.phasecenter, grid.stokes, grid.needs_frequencies,
+                             scratch=scratch_of(output.imagename, found.workload))
     check_pointings(data, grid)
     if grid.is_mosaic:
         data, grid = with_beams(data, selection, grid)
@@ -125,7 +169,7 @@ def dry_run(selection, grid, options, blocks, limits):
     everything = data.size
     if grid.is_cube:
         data = _fullest_channel(data, selection, grid)
-    block_of_sample, _ = divided_by_band(*divide(data, blocks), data, grid.subbands)
+    block_of_sample, _ = divided_by_band(*divide(data, output.blocks), data, grid.subbands)
     data, offsets = sort_into_blocks(data, block_of_sample)
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
     timing = replace(timing, channels=max(found.workload.channels, 1))

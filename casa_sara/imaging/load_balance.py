@@ -14,7 +14,7 @@ from casa_sara.operators.dictionary import filter_lengths
 from casa_sara.operators.measurement import grid_bytes
 from casa_sara.parallel.partition import RankAssignment
 
-__all__ = ["basis_costs", "assign_ranks", "operator_costs"]
+__all__ = ["assign_ranks", "basis_costs", "operator_costs", "solver_samples"]
 
 DIRAC, WAVELET, TAP = 2.3, 3.3, 0.17  # of a pixel: the pixel basis, a wavelet, and more for each tap
 PIXEL, CELL, SAMPLE = 8.1, 6.2, 132.0  # of the operator and its adjoint: a pixel, a cell of the uv grid, a visibility
@@ -28,11 +28,21 @@ def basis_costs(wavelets, shape):
     return np.where(taps > 0, WAVELET + TAP * taps, DIRAC) * math.prod(shape) * 1e-9
 
 
-def operator_costs(volume, grid):
-    """Seconds that the operator takes on every rank that has visibilities, and those that these ranks share."""
+def solver_samples(volume, grid, options):
+    """Return how many samples an iteration is thought to have: those that there are, or averages of them.
+
+    More averages than pixels there are only where cells are not enlarged any more, and more than half of the samples
+    never.
+    """
+    averages = options.averages and not grid.is_mosaic and grid.nterms == 1
+    return min(volume.samples // 2, math.prod(grid.shape)) if averages else volume.samples
+
+
+def operator_costs(volume, grid, samples):
+    """Seconds that the operator takes on every rank that has some of these samples, and those that the ranks share."""
     reach = [min(max(wave * cell, 1e-6), 0.5) for wave, cell in zip(volume.reach, grid.cell_rad)]
-    cells = grid_bytes(volume.samples, reach, grid.shape) / CELL_BYTES
-    return (PIXEL * math.prod(grid.shape) + CELL * cells) * 1e-9, SAMPLE * volume.samples * 1e-9
+    cells = grid_bytes(samples, reach, grid.shape) / CELL_BYTES
+    return (PIXEL * math.prod(grid.shape) + CELL * cells) * 1e-9, SAMPLE * samples * 1e-9
 
 
 def assign_ranks(comm, volume, grid, options, fits=lambda ranks: True):
@@ -61,7 +71,7 @@ def assign_ranks(comm, volume, grid, options, fits=lambda ranks: True):
     if comm.size == 1:
         return RankAssignment(comm)
     bases = basis_costs(options.wavelets, grid.shape) * (options.niter > 0)
-    fixed, shared = operator_costs(volume, grid)
+    fixed, shared = operator_costs(volume, grid, solver_samples(volume, grid, options))
     plans = []
     for readers in range(1, comm.size + 1):
         ranks = RankAssignment(comm, readers)

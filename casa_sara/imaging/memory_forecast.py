@@ -5,12 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from casa_sara.data.averaging import WORTHWHILE
+from casa_sara.data.averaging import WORTHWHILE, cell_sides
+from casa_sara.data.blocks import SNAPSHOT_SAMPLES
 from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
 from casa_sara.operators.sky import further_bytes
 from casa_sara.parallel.partition import ALONE
 from casa_sara.reconstruction.bootstrap import MOST_GROUPS
+from casa_sara.reconstruction.problem import MOST_DOUBLINGS
+from casa_sara.runtime.scratch import PIECE
 
 __all__ = ["Forecast", "Workload", "forecast"]
 
@@ -26,6 +29,9 @@ PASSING = 12  # weights of a pass between the iterations
 AVERAGED = 16  # of all: whitened, the numbers of their cells, the density
 AVERAGE = 72  # of an average: that of SOLVER, POINT and the sums of its cell
 RENEWING = 24  # of all: residual and its sums
+# samples on the disk: of each, of each of the largest block, and of each of a piece that is worked on
+HELD, OF_BLOCK, OF_PIECE = 12, 70, 160
+FILLED = 0.5  # of the uv cells within reach, at most
 WEIGHING = 30  # uv cells and densities
 SORTING = 12  # of a cube: channels of the samples, and their order
 CHECKPOINT = 16  # the dual and Φz
@@ -73,6 +79,8 @@ class Workload:
     draws: int = 0  # of bootstrap and jackknife
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
     averages: bool = False  # visibilities may be averaged
+    on_disk: bool = False  # and are kept on the disk
+    blocks: int = 0  # asked for; 0 for those of the automatic rule
     nterms: int = 1  # images that are solved for together
 
     @classmethod
@@ -94,6 +102,8 @@ class Workload:
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
+        if self.on_disk and not self.channels:
+            return self._on_disk()
         return self._of_cube() if self.channels else self._of_plane()
 
     def _of_cube(self):
@@ -110,6 +120,26 @@ class Workload:
                 "writing": {"libraries": LIBRARIES, **held,
                             "process that writes": self._planes((PLANE + CUBES + MASK * self.masked + 1)
                                                                 * self.channels)}}
+
+    def _on_disk(self):
+        """The phases of one plane whose samples are on the disk: those of its averages, beside what is in memory."""
+        averages = self.most_averages()
+        largest = math.ceil(self.samples / self.blocks) if self.blocks else min(self.samples, SNAPSHOT_SAMPLES)
+        held = {"visibilities": HELD * self.samples, "visibilities of a block": OF_BLOCK * largest,
+                "visibilities of a piece": OF_PIECE * min(PIECE, self.samples)}
+        held |= {"grid of visibilities": self._grid()}
+        few = replace(self, samples=averages, on_disk=False, averages=False, precondition=False, whole=(0, 0))
+        phases = few._of_plane()
+        for name in ("reading", "building the operator"):
+            phases.pop(name, None)
+        return {phase: parts | held for phase, parts in phases.items()}
+
+    def most_averages(self):
+        """Return how many averages there are at most: in half of the enlarged cells, but no more than is worthwhile."""
+        v, u, *_ = 2.0**MOST_DOUBLINGS * cell_sides(self.shape, self.cell_rad)
+        cells = FILLED * math.pi * (self.reach[0] / u + 1) * (self.reach[1] / v + 1) / 2  # of half an ellipse
+        blocks = self.blocks or math.ceil(self.samples / SNAPSHOT_SAMPLES)
+        return min(math.ceil(WORTHWHILE * self.samples), math.ceil(cells * blocks))
 
     def _of_plane(self):
         """The phases of one plane, in their order."""

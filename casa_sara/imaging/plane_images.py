@@ -10,6 +10,7 @@ from casa_sara.casa.images.restore import fit_beam
 from casa_sara.casa.ms.weights import dirty_image, imaging_weights, sum_of_weights
 from casa_sara.imaging.mosaic import flat_noise, weight_image
 from casa_sara.operators.measurement import Summed
+from casa_sara.operators.piecewise import operator_on_disk
 from casa_sara.operators.sky import sky_operator
 from casa_sara.parallel.serial import SERIAL
 
@@ -69,7 +70,7 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     if grid.is_mosaic:
         operator = _operator(data, grid, options, comm)
     seen = model if grid.subbands is None else grid.subbands.stacked(model)
-    residual = dirty_image(operator, data.vis - _predicted(operator, data, grid, options, seen, comm), weights, comm)
+    residual = dirty_image(operator, _residual(operator, data, grid, options, seen, comm), weights, comm)
     pixels = dict(psf=psf, residual=residual, model=model)
     if grid.is_mosaic:
         pixels["weight"] = weight_image(data, grid, weights)
@@ -81,18 +82,32 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     return PlaneImages(pixels, weights, comm.total(sumwt), beam)
 
 
-def _predicted(operator, data, grid, options, model, comm):
-    """Return the visibilities of a model, by the operator of the dirty images unless there are spectra."""
+def _residual(operator, data, grid, options, model, comm):
+    """Return the visibilities less those of a model; of samples on the disk what gives them piece by piece.
+
+    These are predicted by the operator of the dirty images unless there are spectra.
+    """
+    if data.scratch.on_disk and grid.spectrum is None:
+        return lambda piece, operator: data.vis[piece] - operator.forward(model)
     if grid.spectrum is not None or grid.subbands is not None:
-        operator = sky_operator(data.uvw, grid, data.freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm,
-                                beam=data.beam)
-    return operator.forward(model)
+        operator = _sky_operator(data, grid, options, comm, data.freq_hz)
+    if data.scratch.on_disk:
+        predicted = operator.forward_pieces(model)
+        return lambda piece, _: data.vis[piece] - next(predicted)
+    return data.vis - operator.forward(model)
+
+
+def _sky_operator(data, grid, options, comm, freq_hz=None):
+    """Return the operator of the samples, without weights."""
+    if data.scratch.on_disk:
+        return operator_on_disk(data.uvw, grid, freq_hz, IMAGE_EPS, options.nthreads, data.scratch)
+    return sky_operator(data.uvw, grid, freq_hz, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm, beam=data.beam)
 
 
 def _operator(data, grid, options, comm):
     """Return the operator of the dirty images, for flat spectra."""
-    return Summed(sky_operator(data.uvw, grid, eps=IMAGE_EPS, nthreads=options.nthreads, comm=comm, beam=data.beam),
-                  comm)
+    operator = _sky_operator(data, grid, options, comm)
+    return operator if data.scratch.on_disk else Summed(operator, comm)
 
 
 def point_spread(data, grid, weighting, options, plane, comm):
@@ -103,5 +118,11 @@ def point_spread(data, grid, weighting, options, plane, comm):
     weights = imaging_weights(data, grid, weighting, comm)
     single = replace(grid, gridder="standard", mosaic=None) if grid.is_mosaic else grid
     operator = _operator(data, single, options, comm)
-    psf = dirty_image(operator, np.ones(data.size, np.complex64), weights, comm)
+    ones = _ones if data.scratch.on_disk else np.ones(data.size, np.complex64)
+    psf = dirty_image(operator, ones, weights, comm)
     return weights, operator, psf, comm.once(fit_beam, psf, plane)
+
+
+def _ones(piece, operator):
+    """Return the visibilities of a source in the centre of the image."""
+    return np.ones(operator.size, np.complex64)

@@ -15,7 +15,7 @@ transform; the blocks of the data are slices of its result.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,8 +28,8 @@ from casa_sara.operators.decimation import AxisDecimation, separable
 from casa_sara.operators.nufft import NonUniformFFT, memory_size
 from casa_sara.parallel.serial import SERIAL, Serial
 
-__all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "check_cell", "check_field", "choose_eps", "grid_bytes",
-           "share_of", "share_work_space"]
+__all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "WorkSpace", "check_cell", "check_field", "choose_eps",
+           "eps_of", "grid_bytes", "share_of", "share_work_space"]
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 LARGEST_EPS = 1e-4
@@ -138,6 +138,19 @@ class MeasurementOperator:
         self._nufft.to_points(out)
         return out
 
+    def keep_in(self, space: WorkSpace, empty: Callable[..., np.ndarray]) -> None:
+        """Work in a space that others use, too, and keep what there is of each visibility in other memory.
+
+        Parameters
+        ----------
+        space : WorkSpace
+            For the grid.
+        empty : callable
+            Makes an array from shape and dtype.
+        """
+        space.admit(self)
+        self._nufft.points_in(empty)
+
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Return the real image Re(Φ†·vis), (nx, ny), of complex visibilities (M,), in `out` where given.
 
@@ -159,6 +172,32 @@ class MeasurementOperator:
         self.workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
         self.workers.run(expand_rows, self._lines, self._rows, out)
         return out
+
+
+class WorkSpace:
+    """The grid of operators that are applied one after the other: as large as the largest of them needs."""
+
+    def __init__(self) -> None:
+        self._users: list[MeasurementOperator] = []
+        self._memory = self._lines = np.empty(0, np.float32)
+
+    def admit(self, operator: MeasurementOperator) -> None:
+        """Let one more operator use it.
+
+        Parameters
+        ----------
+        operator : MeasurementOperator
+            In single precision.
+        """
+        self._users.append(operator)
+        users = [operator]
+        if operator._nufft.memory_size > self._memory.size or operator._lines.size > self._lines.size:
+            self._memory = np.empty(max(operator._nufft.memory_size, self._memory.size), np.float32)
+            self._lines = np.empty(max(operator._lines.size, self._lines.size), np.float32)
+            users = self._users
+        for user in users:
+            user._nufft.work_in(self._memory)
+            user._lines = self._lines[: user._lines.size].reshape(user._lines.shape)
 
 
 def share_work_space(operators: Sequence[MeasurementOperator]) -> None:
@@ -372,4 +411,21 @@ def choose_eps(vis: np.ndarray, weight: np.ndarray, dtype: npt.DTypeLike = np.fl
     """
     peak, total = comm.allreduce(np.array([np.sum(values, dtype=np.float64)
                                            for values in (weight * np.abs(vis), weight)]))
+    return eps_of(peak, total, dtype)
+
+
+def eps_of(peak: float, total: float, dtype: npt.DTypeLike = np.float32) -> float:
+    """Return :func:`choose_eps` of the sums Σw|V| and Σw.
+
+    Parameters
+    ----------
+    peak, total : float
+        Σw|V| and Σw.
+    dtype : float32 or float64
+        Of the operator.
+
+    Returns
+    -------
+    float
+    """
     return float(np.clip(np.sqrt(total) / max(peak, 1e-300), SMALLEST_EPS[np.dtype(dtype)], LARGEST_EPS))

@@ -17,7 +17,7 @@ of threads.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -118,6 +118,20 @@ class NonUniformFFT:
     def memory_size(self) -> int:
         """Number of reals in the grid and the pieces."""
         return self._memory.size
+
+    def points_in(self, empty: Callable[..., np.ndarray]) -> None:
+        """Keep what there is of each point in other memory.
+
+        Parameters
+        ----------
+        empty : callable
+            Makes an array from shape and dtype.
+        """
+        moved = []
+        for array in self._points:
+            moved.append(empty(array.shape, array.dtype))
+            moved[-1][...] = array
+        self._points = Points(*moved)
 
     def work_in(self, memory: np.ndarray) -> None:
         """Work in this memory from now on, which others may use between the calls.

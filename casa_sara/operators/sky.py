@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from casa_sara.operators._workers import Workers
 from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, NoVisibilities, share_of
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
 from casa_sara.operators.mosaic import MosaicOperator
@@ -35,7 +36,7 @@ MOSAIC_SAMPLE, MOSAIC_PIXEL = 24, 24  # rotation, index and beam, and the visibi
 def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have a default
                  freq_hz: np.ndarray | None = None, row_scale: np.ndarray | None = None, eps: float = 1e-6,
                  dtype: npt.DTypeLike = np.float32,
-                 nthreads: int = 1, comm: Serial = SERIAL, beam: np.ndarray | None = None,
+                 nthreads: int | Workers = 1, comm: Serial = SERIAL, beam: np.ndarray | None = None,
                  ) -> (MeasurementOperator | ModulatedOperator | MosaicOperator | SubbandOperator | WGridder
                        | NoVisibilities):
     """Return the measurement operator of an image.
@@ -61,7 +62,8 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
     """
     def of_place(row_scale, eps):
         if grid.mosaic is not None:
-            return MosaicOperator(uvw, np.asarray(beam), grid.mosaic, row_scale, eps, dtype, nthreads)
+            count = nthreads.count if isinstance(nthreads, Workers) else nthreads
+            return MosaicOperator(uvw, np.asarray(beam), grid.mosaic, row_scale, eps, dtype, count)
         return _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm)
 
     if grid.subbands is not None and freq_hz is not None:

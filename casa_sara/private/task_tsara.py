@@ -78,7 +78,8 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
         raise ValueError("dryrun = True with parallel = True: a dry run takes one process; the memory of each rank is "
                          "in the first lines of the log of a normal run, and docs/parallel.md explains its time")
     if parameters["dryrun"]:
-        return {"forecast": dry_run(selection, grid, options, _blocks(parameters), limits)}
+        output = Output(parameters["imagename"], blocks=_blocks(parameters))
+        return {"forecast": dry_run(selection, grid, options, output, limits)}
     make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)

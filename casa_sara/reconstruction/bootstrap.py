@@ -97,6 +97,7 @@ class Bootstrap:
     def _observe(self):
         """Replace the data by those of the present draw, which depend on its number alone."""
         ppd, noise = self.ppd, self.ppd.scratch_vis
+        ppd.correction = None  # the noise is that of averages
         ppd.measurement.forward(self.model, ppd.vis)
         draw_noise(ppd, np.random.default_rng([SEED, len(self.draws)]), self.bounds.noise, noise)
         ppd.vis += noise

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import prod
+from math import inf, prod
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from casa_sara.data.outliers import find_wild
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
+from casa_sara.operators.piecewise import operator_on_disk
 from casa_sara.operators.single_dish import Stacked
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.widefield import WTerm
@@ -30,8 +31,10 @@ __all__ = ["Findings", "Problem", "Samples", "averaging_cell", "first_image"]
 
 ROUNDS = 6  # of leaving out wild samples, and of another first image
 LARGEST_ERROR = 1.0  # of the averages of the first image, in units of their noise: docs/decisions.md, "Averages"
+MOST_DOUBLINGS = 2  # of the cells, where there are more averages than pixels
 MOST_HALVINGS = 8  # what is still wrong in cells 256 times smaller is not due to them
 DYNAMIC_RANGE = 1e5  # of whitened visibilities: their noise is never taken for less than rms/DYNAMIC_RANGE
+ON_DISK_EPS = 1e-6  # of the operator of samples on the disk, which makes images, too
 STEEPEST = 2.0  # spectral index for which averages over frequency are made, where it is not known
 LIGHT = 1e-2  # of the mean weight Σw²/Σw: no density counts as less
 
@@ -66,7 +69,7 @@ class Samples:
     def __post_init__(self):
         self.offsets = np.asarray(self.offsets)
         if self.kept is None:
-            self.kept = np.arange(self.data.size)
+            self.kept = np.arange(self.data.size, dtype=np.int32 if self.data.scratch.on_disk else int)
 
     def without(self, index: np.ndarray) -> Samples:
         """Leave out samples, numbered as they are here.
@@ -153,7 +156,7 @@ class Problem:
         support : bool (nx, ny), optional
             Pixels that may be non-zero; all by default.
         finer : int (d,), optional
-            How many times the cells of each block's averages are halved.
+            How many times the cells of each block's averages are halved; found by default.
         comm : casa_sara.parallel.serial.Serial or MPI
             Over whose ranks the samples are spread.
 
@@ -161,20 +164,17 @@ class Problem:
         -------
         Problem
         """
-        data, root_weight = samples.data, np.sqrt(samples.data.weight)
+        data, offsets = samples.data, samples.offsets
         operator = partial(sky_operator, grid=grid, eps=eps, nthreads=options.nthreads, comm=comm)
-        vis, offsets = data.vis * root_weight, samples.offsets
-        measurement = operator(data.uvw, freq_hz=data.freq_hz, row_scale=root_weight * np.float32(unit_jy),
-                               beam=data.beam)
+        vis: Any = None if data.scratch.on_disk else data.vis * np.sqrt(data.weight)
+        measurement = _whitened_operator(data, operator, grid, options, unit_jy)
         precond = of_samples = _preconditioner(samples, options.precondition, comm, grid.subbands)
         averaged = None
         if options.averages and grid.mosaic is None:
-            with suppress(OverflowError):  # hardly two samples share one of so many cells
-                averaged, uvw, freq_hz = Averaged.of(data, offsets, averaging_cell(grid), finer, vis, measurement, comm)
-        if averaged is not None and comm.total(averaged.cells.size) > WORTHWHILE * comm.total(data.size):
-            averaged = None
+            averaged, uvw, freq_hz = _averages(partial(Averaged.of, data, offsets, averaging_cell(grid), vis=vis,
+                                                       operator=measurement, comm=comm), samples, finer, grid, options)
         if averaged is not None:
-            vis, offsets = averaged.whitened_mean(vis), averaged.cells.offsets
+            vis, offsets = averaged.whitened_mean(averaged.whitened), averaged.cells.offsets
             precond = averaged.weighted_mean(precond).astype(np.float32)
             root_weight = np.sqrt(averaged.sum_of_weights, dtype=np.float32, casting="same_kind")
             measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy))
@@ -226,6 +226,45 @@ class Problem:
         return self.unit_jy * float(np.abs(sky).sum(dtype=float))
 
 
+def _averages(average, samples, finer, grid, options):
+    """Return what `average` makes of the samples, None where that is not worthwhile.
+
+    Unless `finer` says how large the cells are they are enlarged while there are more averages than pixels: to a phase
+    of up to 0.4 rad, which those of samples on the disk have at once.
+    """
+    enlarging = finer is None and not options.jackknife and grid.subbands is None and samples.total_power is None
+    on_disk, blocks = samples.data.scratch.on_disk, len(samples.offsets) - 1
+    if finer is None:
+        finer = np.full(blocks, -MOST_DOUBLINGS if on_disk and enlarging else 0)
+    while True:
+        found, averages, most = (None, None, None), inf, inf
+        with suppress(OverflowError):  # hardly two samples share one of so many cells
+            found = average(finer)
+            comm = found[0].comm
+            averages, most = comm.total(found[0].cells.size), WORTHWHILE * comm.total(samples.data.size)
+        if not enlarging or averages <= prod(grid.shape) or finer.min() == -MOST_DOUBLINGS:
+            break
+        finer = finer - 1
+    if averages <= most < inf:
+        return found
+    if on_disk:
+        raise MemoryError(f"imsize = {list(grid.shape)}: the {samples.data.size} visibilities would be averaged to "
+                          f"{averages}, which do not fit into memory: fewer blocks, a smaller image or fewer "
+                          "visibilities would")
+    return None, None, None
+
+
+def _whitened_operator(data, operator, grid, options, unit_jy):
+    """Return Φ of all samples; of samples on the disk in pieces."""
+    def of(uvw, weight, freq_hz, beam):
+        return operator(uvw, freq_hz=freq_hz, row_scale=np.sqrt(weight) * np.float32(unit_jy), beam=beam)
+
+    if not data.scratch.on_disk:
+        return of(data.uvw, data.weight, data.freq_hz, data.beam)
+    whole = operator_on_disk(data.uvw, grid, data.freq_hz, ON_DISK_EPS, options.nthreads, data.scratch)
+    return whole.scaled(lambda piece: np.sqrt(data.weight[piece]) * np.float32(unit_jy))
+
+
 def averaging_cell(grid: ImageGrid) -> np.ndarray:
     """Return the sides of the cells within which samples are averaged: :func:`casa_sara.data.averaging.cell_sides`.
 
@@ -273,7 +312,7 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         In `problem.unit_jy`.
     """
     everything, wild, layout = samples.data.size, [], Layout(samples.offsets, comm)
-    finer, rounds = np.zeros(len(samples.offsets) - 1, int), 0
+    finer, rounds = None, 0
     while True:
         problem = problem_of(samples, finer=finer)
         first, left = nnls(Summed(problem.measurement, comm), problem.vis, problem.precond, problem.data_norm_sq,
@@ -281,20 +320,23 @@ def first_image(samples: Samples, problem_of: Callable[..., Problem], options: S
         left = left[: left.size - (0 if problem.dish is None else problem.dish.vis.size)]
         residual = left if problem.averaged is None else problem.averaged.residual(first)
         error = _averaging_error(problem, residual, left, comm)
-        if error.max() > LARGEST_ERROR and finer.max() < MOST_HALVINGS and not stopped():
+        used = problem.averaged.finer if problem.averaged else np.zeros(len(samples.offsets) - 1, int)
+        if error.max() > LARGEST_ERROR and used.max() < MOST_HALVINGS and not stopped():
             # it goes with the square of the side
-            finer = finer + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
+            finer = used + np.ceil(0.5 * np.log2(np.maximum(error / LARGEST_ERROR, 1))).astype(int)
             continue
         found = find_wild(samples.data, samples.offsets, residual, problem.flux_jy(first), comm)
         if comm.total(found.index.size) == 0 or rounds == ROUNDS:
             break
         wild += _told_of_all(found, samples, layout, comm)
-        samples, finer, rounds = samples.without(found.index), np.zeros_like(finer), rounds + 1
-    left_out = np.setdiff1d(np.arange(everything), samples.kept)
+        samples, finer, rounds = samples.without(found.index), None, rounds + 1
+    gone = np.ones(everything, bool)
+    gone[samples.kept[samples.kept < everything]] = False
+    left_out = np.flatnonzero(gone)
     norms = _norms(residual, samples.offsets, comm)
     if problem.dish is not None:
         norms = np.append(norms, problem.dish.noise_norm(options.positivity, problem.support))
-    return problem, Findings(left_out, wild, norms, problem.data_norm_sq, finer, float(error.max())), first
+    return problem, Findings(left_out, wild, norms, problem.data_norm_sq, used, float(error.max())), first
 
 
 def _norms(vis, offsets, comm):
@@ -311,7 +353,7 @@ def _averaging_error(problem, residual, of_averages, comm):
     if averaged is None:
         return np.zeros(len(samples.offsets) - 1)
     left, rms = (_norms(vis, samples.offsets, comm) / np.sqrt(2 * np.maximum(averaged.samples, 1))
-                 for vis in (residual, averaged.vis))
+                 for vis in (residual, averaged.whitened))
     noise = left if samples.noise is None else np.where(np.isfinite(samples.noise), samples.noise, left)
     return averaged.error(residual, of_averages) / np.maximum(noise, rms / DYNAMIC_RANGE + np.finfo(float).tiny)
 
@@ -338,11 +380,21 @@ def _preconditioner(samples, wanted, comm, subbands=None):
     Of several frequencies it is that times Σ_t g_t², g_t what each image contributes to the sample: where in the uv
     plane there are but samples of the edges of the band, these would weigh up to T² times as much as the others.
     """
-    weight = samples.data.weight
+    data, scratch = samples.data, samples.data.scratch
     if not wanted:
-        return np.ones(weight.size, np.float32)
-    mean = comm.total(float(np.square(weight, dtype=float).sum())) / comm.total(float(weight.sum(dtype=float)))
-    precond = 1.0 / np.maximum(np.asarray(samples.density, float), LIGHT * mean)
-    if subbands is not None:
-        precond /= np.square(subbands.factors(samples.data.freq_hz)).sum(axis=0)
-    return (precond / comm.largest(precond.max(initial=0))).astype(np.float32)
+        return np.ones(data.size, np.float32)
+    squares = weights = 0.0
+    for piece in scratch.pieces(0, data.size):
+        squares += float(np.square(data.weight[piece], dtype=float).sum())
+        weights += float(data.weight[piece].sum(dtype=float))
+    least = LIGHT * (comm.total(squares) / comm.total(weights))
+
+    def inverse(piece):
+        precond = 1.0 / np.maximum(np.asarray(samples.density[piece], float), least)
+        return precond if subbands is None else precond / np.square(subbands.factors(data.freq_hz[piece])).sum(axis=0)
+
+    greatest = comm.largest(max(inverse(piece).max(initial=0) for piece in scratch.pieces(0, data.size)))
+    precond = scratch.empty(data.size, np.float32)
+    for piece in scratch.pieces(0, data.size):
+        precond[piece] = inverse(piece) / greatest
+    return precond

@@ -21,7 +21,7 @@ from casa_sara.reconstruction.problem import Problem, Samples, averaging_cell
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import check_l2bound, operator_accuracy, schedule_of
 from casa_sara.reconstruction.solution import begin, begin_draws, resume
-from casa_sara.reconstruction.state_file import digest
+from casa_sara.reconstruction.state_file import digest, digest_on_disk
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.dabbech2018 import run_paper_algorithm_2
 from casa_sara.solver.islands import add_flux_errors
@@ -170,9 +170,10 @@ def _averaging(solution, sides):
     ppd, found = solution.ppd, solution.found
     if ppd.averaged is None:
         return {}
-    averages = int(ppd.block_sizes[:len(found.finer)].sum())
-    return dict(averages=averages, cell_wavelengths=[float(sides[1]), float(sides[0])],
-                halvings=found.finer.tolist(), largest_error=found.averaging_error)
+    averages, enlarged = int(ppd.block_sizes[:len(found.finer)].sum()), min(0, int(found.finer.min()))
+    return dict(averages=averages, halvings=(found.finer - enlarged).tolist(),
+                cell_wavelengths=[float(side) * 2.0**-enlarged for side in (sides[1], sides[0])],
+                largest_error=found.averaging_error)
 
 
 def _averaging_words(ppd, averaging, options, grid, sides):
@@ -181,6 +182,8 @@ def _averaging_words(ppd, averaging, options, grid, sides):
     if averaging:
         smaller = 2 ** max(averaging["halvings"])
         finer = f", or up to {smaller} times smaller" if smaller > 1 else ""
+        u, v = averaging["cell_wavelengths"]
+        cell = f"uv cells of {u:.4g} x {v:.4g} wavelengths"
         count = ppd.samples[:len(averaging["halvings"])].sum()
         return (f"{count} visibilities are averaged to {averaging['averages']} for the solver, within each "
                 f"block and {cell}{finer}; for the first image the averages are wrong by up to "
@@ -197,8 +200,10 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     data = samples.data
     gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=samples.density)
     digests: dict[str, str | None] = {
-        name: digest(whole) for name, array in gathered.items()
-        if (whole := layout.gather(np.ascontiguousarray(array))) is not None}
+        name: digest(whole) for name, array in gathered.items() if not data.scratch.on_disk
+        and (whole := layout.gather(np.ascontiguousarray(array))) is not None}
+    if data.scratch.on_disk:
+        digests |= {name: digest_on_disk(array, data.scratch) for name, array in gathered.items()}
     spectralindex = grid.spectrum and np.asarray(grid.spectrum.index)
     subbands = grid.subbands and grid.subbands.freqs_hz
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(

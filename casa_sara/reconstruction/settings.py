@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from casa_sara.data.visibilities import Visibilities
-from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps
+from casa_sara.operators.measurement import SMALLEST_EPS, choose_eps, eps_of
 from casa_sara.options import SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.paper_method import PAPER, paper_bounds
@@ -54,6 +54,13 @@ def operator_accuracy(data: Visibilities, offsets: np.ndarray, noise: np.ndarray
     """
     if noise is None or not np.all(np.asarray(noise) > 0):
         return SMALLEST_EPS[np.dtype(np.float32)]
+    if data.scratch.on_disk:
+        sums = np.zeros(2)
+        for start, stop, one in zip(offsets[:-1], offsets[1:], np.square(noise, dtype=float)):
+            for piece in data.scratch.pieces(start, stop):
+                weight = data.weight[piece] / one
+                sums += np.sum(weight * np.abs(data.vis[piece])), np.sum(weight)
+        return eps_of(*sums)
     level = np.repeat(np.asarray(noise, np.float32), np.diff(offsets))
     return choose_eps(data.vis, data.weight / level**2, comm=comm)
 

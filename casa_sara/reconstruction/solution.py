@@ -243,6 +243,7 @@ def resume(samples: Samples, layout: Layout, problem_of: Callable[..., Problem],
         else:
             solution.stage = (PaperStage if options.method == PAPER else Stage).of(state["stage"])
             solution.ppd.renew_averages(solution.stage.previous)
+            solution.ppd.set_state(ppd)  # the correction is of the multipliers then
     return solution
 
 

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from casa_sara.runtime.atomic import new_file
+from casa_sara.runtime.scratch import Scratch
 
-__all__ = ["CheckpointError", "digest", "read", "write"]
+__all__ = ["CheckpointError", "digest", "digest_on_disk", "read", "write"]
 
 MAGIC = b"casa_sara checkpoint 1\n"  # the number is that of the format
 TYPES = ("<f2", "<f4", "<f8", "<c8", "<c16", "<i4", "<i8", "|b1")
@@ -135,6 +136,28 @@ def _join(state, entry, raw, place):
 
 def _bytes(array):
     return array.reshape(-1).view(np.uint8)
+
+
+def digest_on_disk(array: np.ndarray, scratch: Scratch) -> str:
+    """Return the SHA-256 of the SHA-256 of each row of an array (n, M) or (M,), which is read piece by piece.
+
+    Parameters
+    ----------
+    array : (n, M) or (M,)
+        Any array.
+    scratch : Scratch
+        Where it is.
+
+    Returns
+    -------
+    str
+    """
+    of_rows = []
+    for row in np.atleast_2d(array):
+        of_rows.append(hashlib.sha256())
+        for piece in scratch.pieces(0, row.size):
+            of_rows[-1].update(_bytes(row[piece]))
+    return hashlib.sha256(b"".join(one.digest() for one in of_rows)).hexdigest()
 
 
 def digest(array: np.ndarray) -> str:

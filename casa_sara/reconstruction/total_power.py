@@ -186,7 +186,10 @@ class Beside:
     def __init__(self, averaged: Any, dish: np.ndarray) -> None:
         self._averaged, self._dish = averaged, dish
 
-    def renew(self, model: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    enlarged = costly = False
+
+    def renew(self, model: np.ndarray, predicted: np.ndarray,
+              multipliers: np.ndarray | None = None) -> tuple[np.ndarray, None]:
         """Turn Φ̄x of the averages into ȳ, and Φx of the dish into y.
 
         Parameters
@@ -195,12 +198,15 @@ class Beside:
             x.
         predicted : complex (cells + M,)
             Φ̄x and Φx.
+        multipliers : None
+            Cells are not enlarged.
 
         Returns
         -------
-        float64 (d + 1,)
-            The scatter of each block; that of the dish has none.
+        scatter : float64 (d + 1,)
+            Of each block; that of the dish has none.
+        gradient : None
         """
         count = predicted.size - self._dish.size
         predicted[count:] = self._dish
-        return np.append(self._averaged.renew(model, predicted[:count]), 0.0)
+        return np.append(self._averaged.renew(model, predicted[:count])[0], 0.0), None

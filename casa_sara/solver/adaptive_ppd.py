@@ -95,6 +95,9 @@ class AdaptivePPD:
         M_j, samples of each block, before they were averaged.
     scatter : float (d,)
         What the averages leave out of ‖y_j − Φ_j x‖², because it is the same for all x.
+    correction : real (nx, ny) or None
+        What averages in enlarged cells leave out of Φ†v, because it is the same for all x: at a fixed point v is
+        λ(Φx − y) of all samples. It belongs to the multipliers.
     model, model_bar : real (nx, ny)
         x and x̄.
     anchor : real (nx, ny)
@@ -159,6 +162,7 @@ class AdaptivePPD:
         self.begins, self.block_sizes = comm.exscan(np.diff(self.offsets))
         self.averaged: Any = None
         self.samples, self.scatter = self.block_sizes, np.zeros(self.n_blocks)
+        self.correction: np.ndarray | None = None
         self.residual_norms = comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()]))
         self._pieces = np.array([(a, min(a + PIECE, stop), j) for j, (start, stop) in enumerate(self.blocks())
                                  for a in range(start, stop, PIECE)], dtype=int).reshape(-1, 3)
@@ -242,14 +246,26 @@ class AdaptivePPD:
     def renew_averages(self, model: np.ndarray) -> None:
         """Where the samples are averages, make them anew: what they leave of this model, and their scatter, are exact.
 
+        Where their cells are enlarged, the gradient is made exact as well, for the present multipliers.
+
         Parameters
         ----------
         model : real (nx, ny)
             In the unit of the iteration.
         """
-        if self.averaged is not None:
-            self.measurement.forward(model, self.vis)
-            self.scatter = self.averaged.renew(model, self.vis)
+        if self.averaged is None:
+            return
+        predicted = self.measurement.forward(model, self.scratch_vis)
+        np.copyto(self.vis, predicted)
+        enlarged = self.averaged.enlarged
+        self.scatter, gradient = self.averaged.renew(model, self.vis, self.multipliers if enlarged else None)
+        self.correction = None
+        if enlarged:
+            left = np.subtract(self.vis, predicted, out=predicted)
+            left *= np.repeat(self.multipliers.astype(self.precond.dtype), np.diff(self.offsets))
+            correction = self.measurement.adjoint(left)
+            correction -= gradient
+            self.correction = self.comm.allreduce(correction)
 
     def constrain(self, l2_bounds: np.ndarray) -> None:
         """From now on, keep every block within its bound ε_j, float (d,): Step 5 finds the multipliers.
@@ -269,6 +285,9 @@ class AdaptivePPD:
         multipliers : float (d,)
             λ_j ≥ 0.
         """
+        before, after = self.multipliers.sum(), np.sum(multipliers)
+        if self.correction is not None and before > 0:
+            self.correction *= self.correction.dtype.type(after / before)
         self.multipliers[:], self.constrained = multipliers, False
 
     def step(self) -> None:
@@ -291,6 +310,8 @@ class AdaptivePPD:
         self._norms_sq[:] = np.bincount(self._pieces[:, 2], self._piece_norms_sq, self.n_blocks)
         summed_norms_sq = self.comm.iallreduce(self._norms_sq)
         self.measurement.adjoint(self.l2_dual, self._data_gradient)
+        if self.correction is not None and self.comm.rank == 0:
+            self._data_gradient += self.correction
         return summed_norms_sq
 
     def _update_multipliers(self):
@@ -338,7 +359,7 @@ class AdaptivePPD:
         if self.comm.size == 1:
             return gradients, steps
         run, real = self.measurement.workers.run, type(steps[1])
-        if self.vis.size:
+        if self.vis.size or self.correction is not None:
             run(kernels.add_scaled, *gradients, steps[1])
         if not self._slots:
             gradient = self.comm.allreduce(self._prior_gradient)
@@ -380,6 +401,8 @@ class AdaptivePPD:
             self.l1_dual *= self.l1_dual.dtype.type(factor)
             self.l2_dual *= self.precond.dtype.type(factor)
             self.multipliers *= factor
+            if self.correction is not None:
+                self.correction *= self.correction.dtype.type(factor)
         self.threshold = float(threshold)
 
     def state(self) -> dict[str, Any]:
@@ -392,7 +415,7 @@ class AdaptivePPD:
         """
         arrays = {name: getattr(self, name) for name in STATE_ARRAYS}
         values = {name: getattr(self, name) for name in STATE_VALUES}
-        return arrays | values | dict(l2_bounds=self.l2_bounds, points=self.points.places)
+        return arrays | values | dict(l2_bounds=self.l2_bounds, points=self.points.places, correction=self.correction)
 
     def set_state(self, state: dict[str, Any]) -> None:
         """Take over what :meth:`state` has returned, by copies.
@@ -418,3 +441,4 @@ class AdaptivePPD:
             setattr(self, name, state[name])
         self.l2_bounds = np.array(state["l2_bounds"])
         self.points = PointSources(state["points"])
+        self.correction = None if state.get("correction") is None else np.array(state["correction"])

@@ -34,6 +34,7 @@ FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
 NEARLY = 2.0  # bounds may be off by so many of their tolerances where the model changes by one of its own over this
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 USUAL = 9  # re-weightings that most data need
+OF_COSTLY = (0, 1, 2, 4, 8, 16)  # re-weightings at which averages of visibilities on the disk are made anew
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
 
@@ -196,8 +197,8 @@ def run_algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, sche
 
 def _begin(ppd, bounds, schedule):
     """The first problem."""
-    ppd.renew_averages(ppd.model)
     bounds.apply_to(ppd)
+    ppd.renew_averages(ppd.model)
     first_weights(ppd, bounds, schedule.confined)
     stage = Stage(ppd.model.copy(), support=SignificantSupport(schedule.significance) if schedule.confined else None)
     stage.record.bounds.append((0, bounds.l2_bounds.copy()))
@@ -206,6 +207,8 @@ def _begin(ppd, bounds, schedule):
 
 def _begin_last(ppd, bounds, stage):
     """The last problem, with the weights as they are."""
+    if ppd.averaged is not None and ppd.averaged.costly:
+        ppd.renew_averages(ppd.model)
     bounds.finish(ppd)
     stage.last, stage.start, stage.settled = True, ppd.iteration, 0
 
@@ -254,7 +257,8 @@ def _renew_weights(ppd, bounds, schedule, stage):
     """Re-weight by the present solution; return False, with nothing done, when one more would change nothing."""
     change = ppd.comm.bcast_numbers([_relative(ppd.model, stage.previous)])[0]
     stage.previous[...] = ppd.model
-    ppd.renew_averages(stage.previous)
+    if stage.k in OF_COSTLY or ppd.averaged is None or not ppd.averaged.costly:
+        ppd.renew_averages(stage.previous)
     scale = FIRST_SCALE * schedule.reweight_decay**stage.k
     released = stage.release.update(ppd, bounds) if scale <= RELEASE_SCALE else 0
     if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, change):

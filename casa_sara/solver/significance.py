@@ -171,7 +171,10 @@ def gradient_image(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, model
     ppd.measurement.forward(model, vis)
     np.subtract(ppd.vis, vis, out=vis)
     vis *= _whitening(ppd, bounds)
-    return ppd.adjoint(vis, ppd.scratch_image).copy()
+    image = ppd.adjoint(vis, ppd.scratch_image).copy()
+    if ppd.correction is not None:
+        image -= ppd.correction * image.dtype.type(bounds.noise_weights.sum() / ppd.multipliers.sum())
+    return image
 
 
 def _whitening(ppd, bounds):

@@ -14,6 +14,7 @@ from casa_sara.casa.ms.usable_samples import IN_FLAGS, LIGHTEST, SMALLEST, Usabi
 from casa_sara.casa.runtime.tools import opened
 from casa_sara.data.visibilities import RowTable, Visibilities
 from casa_sara.parallel.partition import ALONE
+from casa_sara.runtime.scratch import IN_MEMORY
 
 __all__ = ["read_visibilities"]
 
@@ -36,7 +37,7 @@ _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw"
                "hands": np.int8}
 
 
-def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, ranks=ALONE):
+def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, ranks=ALONE, scratch=IN_MEMORY):
     """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
 
     V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel-hand correlation there is, and as tclean (of
@@ -74,6 +75,8 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     ranks : casa_sara.parallel.partition.RankAssignment
         The ranks that read, each its rows: what is returned is this rank's, but the counts, notes and frequencies are
         of all.
+    scratch : casa_sara.runtime.scratch.Scratch
+        Where the samples go.
 
     Returns
     -------
@@ -90,7 +93,7 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     image = image_direction(phasecenter, selected)
     _check_directions(phasecenter, image, selected)
     comm = ranks.comm
-    table, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, ranks), frequencies)
+    table, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, ranks), frequencies, scratch)
     ranges = np.concatenate(comm.allgather(ranges))
     data = table.usable_visibilities(comm)
     usable, size = table.usable, comm.total(data.size)
@@ -118,9 +121,11 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     )
 
 
-def _read_all(selected, image, pieces, frequencies):
+def _read_all(selected, image, pieces, frequencies, scratch):
     """Return the table of the samples in these pieces, and the frequencies of each MeasurementSet."""
-    table, ranges = _SampleTable(frequencies), []
+    most = sum(rows.size * group.channels.size for ms in selected for number, group in enumerate(ms.groups)
+               for rows in pieces[ms.number, number])
+    table, ranges = _SampleTable(frequencies, scratch, most), []
     for ms in selected:
         geometry = Geometry(ms, image)
         with reading(ms.name), opened("table", ms.name) as tb:
@@ -217,11 +222,12 @@ def _read(part, rows, column, group):
 class _SampleTable:
     """The usable samples of all chunks so far."""
 
-    def __init__(self, frequencies):
-        self.usable = Usability()
+    def __init__(self, frequencies, scratch, most):
+        self.usable, self._scratch = Usability(), scratch
         self._size = self._rows_so_far = 0
         self._alone = []
-        self._samples = {name: [np.empty((3, 0) if name == "uvw" else 0, dtype)]
+        size = most if scratch.on_disk else 0
+        self._samples = {name: [scratch.empty((3, size) if name == "uvw" else size, dtype)]
                          for name, dtype in _SAMPLE_DTYPES.items()
                          if frequencies or name != "freq_hz"}
         self._rows = {name: [np.empty(0, _ROW_DTYPES.get(name, np.int32))] for name in RowTable.__dataclass_fields__}
@@ -250,8 +256,7 @@ class _SampleTable:
         }
         if "freq_hz" in self._samples:
             new["freq_hz"] = geometry.frequencies(group, columns["field"], columns["time"])[ok]
-        for name, values in new.items():
-            self._samples[name].append(values.astype(_SAMPLE_DTYPES[name], copy=False))
+        self._append(new)
         of_group = {name: np.full(kept.size, value)
                     for name, value in (("ms", ms.number), ("spw", group.spw), ("hands", hands))}
         for name, values in (columns | of_group | {"row": chunk.rows}).items():
@@ -259,11 +264,25 @@ class _SampleTable:
         self._rows_so_far += int(kept.sum())
         self._size += vis.size
 
+    def _append(self, new):
+        """Append samples: to a list of chunks, or to what is on the disk."""
+        if not self._scratch.on_disk:
+            for name, values in new.items():
+                self._samples[name].append(values.astype(_SAMPLE_DTYPES[name], copy=False))
+            return
+        for name, values in new.items():
+            self._samples[name][0][..., self._size : self._size + values.shape[-1]] = values
+        self._scratch.let_go()
+
     def usable_visibilities(self, comm):
         """Join the chunks, leave out what is out of proportion to all others, and add up the counts of all ranks."""
         # one column after the other, to keep the peak of memory low
-        samples, rows = ({name: _join(lists, name) for name in tuple(lists)} for lists in (self._samples, self._rows))
-        data = Visibilities(**samples, rows=RowTable(**rows))
+        if self._scratch.on_disk:
+            samples = {name: lists.pop()[..., : self._size] for name, lists in self._samples.items()}
+        else:
+            samples = {name: _join(self._samples, name) for name in tuple(self._samples)}
+        rows = {name: _join(self._rows, name) for name in tuple(self._rows)}
+        data = Visibilities(**samples, rows=RowTable(**rows), scratch=self._scratch)
         ok = self.usable.compare(data, comm)
         self.usable.count_alone((name, np.count_nonzero(ok[index])) for name, index in self._alone)
         self.usable.merge(comm)

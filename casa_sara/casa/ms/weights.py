@@ -14,7 +14,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -24,6 +25,7 @@ from casa_sara.casa.ms.subtables import readable
 from casa_sara.casa.ms.usable_samples import IN_FLAGS
 from casa_sara.casa.runtime.quantities import radians
 from casa_sara.casa.runtime.tools import opened
+from casa_sara.options import ImageGrid, Weighting
 from casa_sara.parallel.serial import SERIAL
 
 __all__ = ["dirty_image", "imaging_weights", "sampling_density", "sum_of_weights"]
@@ -63,7 +65,9 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
     """
     cell = float(min(grid.cell_rad))
     side = math.ceil(max(n * c for n, c in zip(grid.shape, grid.cell_rad)) / cell - 1e-6)
-    u, v = _field_uv(visibilities, "data")
+    if visibilities.scratch.on_disk:
+        return _counted_density(visibilities, side, cell)
+    u, v = _field_uv(visibilities, _window_wave_numbers(visibilities))
     cells = _cells(u, v, (side, side), (cell, cell))
     density = np.zeros(visibilities.size, np.float32)
     in_flags = visibilities.dropped.keys() <= set(IN_FLAGS)
@@ -82,6 +86,22 @@ def sampling_density(visibilities, selection, grid, comm=SERIAL):
         opposite = _cells(-u, -v, (side, side), (cell, cell))
         density[bad] = comm.allreduce(_count(cells, opposite, weight, side * side))[cells[bad]]
     return np.maximum(density, weight)
+
+
+def _counted_density(visibilities, side, cell):
+    """Return the same, counted here, of samples on the disk."""
+    counts, of_windows, uvw_m = np.zeros(side * side), _window_wave_numbers(visibilities), _row_uvw(visibilities)
+
+    def cells_of(part, *signs):
+        u, v = _field_uv(part, of_windows, uvw_m)
+        return [_cells(sign * u, sign * v, (side, side), (cell, cell)) for sign in signs]
+
+    for _, part in visibilities.parts():
+        counts += _count(*cells_of(part, 1, -1), part.imaging_weight, side * side)
+    density = visibilities.scratch.empty(visibilities.size, np.float32)
+    for piece, part in visibilities.parts():
+        density[piece] = np.maximum(counts[cells_of(part, 1)[0]], part.imaging_weight)
+    return density
 
 
 def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
@@ -116,33 +136,63 @@ def imaging_weights(visibilities, grid, weighting, comm=SERIAL):
     if grid.is_mosaic and weighting.mosweight and weighting.weighting != "natural":
         return _weights_by_field(visibilities, grid, replace(weighting, mosweight=False), comm)
     taper = _taper_parameters(weighting.uvtaper)
-    weights = visibilities.imaging_weight.copy()
-    if weighting.weighting == "natural" and taper is None:
-        return weights
-    u, v = _field_uv(visibilities, "LSRK")
+    weights, counts = visibilities.scratch.empty(visibilities.size, np.float32), None
+    uvw_m = None if weighting.weighting == "natural" and taper is None else _row_uvw(visibilities)
     if weighting.weighting != "natural":
-        density = _density(u, v, weights, grid, weighting, comm)
-        weights = np.divide(weights, density, out=np.zeros_like(weights), where=density > 0, casting="same_kind")
-    if taper is not None:
-        weights *= _taper(u, v, *taper)
+        counts = _Counts.of(visibilities, uvw_m, grid, weighting, comm)
+    for piece, part in visibilities.parts():
+        of_part = part.imaging_weight.copy()
+        if uvw_m is not None:
+            u, v = _field_uv(part, uvw_m=uvw_m)
+        if counts is not None:
+            density = counts.density(u, v)
+            of_part = np.divide(of_part, density, out=np.zeros_like(of_part), where=density > 0, casting="same_kind")
+        if taper is not None:
+            of_part *= _taper(u, v, *taper)
+        weights[piece] = of_part
     return weights
 
 
-def _density(u, v, weights, grid, weighting, comm):
-    """Return by what uniform and briggs divide the natural weights, real (M,): 0 beyond the grid."""
+@dataclass
+class _Counts:
+    """The summed natural weights of the samples in the cells of a uv grid."""
+
+    shape: tuple[int, int]
+    grid: ImageGrid
+    weighting: Weighting
+    counts: np.ndarray
+
+    @classmethod
+    def of(cls, visibilities, uvw_m, grid, weighting, comm):
+        """Count."""
+        _check_npixels(weighting)
+        shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
+        counts = cls(shape, grid, weighting, np.zeros(shape[0] * shape[1]))
+        for _, part in visibilities.parts():
+            u, v = _field_uv(part, uvw_m=uvw_m)
+            counts.counts += _count(counts.cells(-u, v), counts.cells(u, -v), part.imaging_weight, counts.counts.size)
+        comm.allreduce(counts.counts)
+        if not counts.counts.any():
+            raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
+        return counts
+
+    def cells(self, u, v):
+        """Return the cell of each sample."""
+        return _cells(u, v, self.shape, self.grid.cell_rad, np.rint if self.grid.is_cube else np.trunc)
+
+    def density(self, u, v):
+        """Return by what uniform and briggs divide the natural weights, real (M,): 0 beyond the grid."""
+        density = self.counts[self.cells(-u, v)]
+        if self.weighting.weighting == "uniform":
+            return density
+        scale = (5.0 * 10.0**-self.weighting.robust) ** 2 * self.counts.sum() / np.square(self.counts).sum()
+        return np.where(density > 0, density * scale + 1.0, 0.0)
+
+
+def _check_npixels(weighting):
+    """Raise where there would be too many cells."""
     if weighting.npixels > MOST_CELLS:
         raise ValueError(f"npixels = {weighting.npixels}: should be at most {MOST_CELLS}")
-    shape = (weighting.npixels, weighting.npixels) if weighting.npixels else grid.shape
-    to_cell = np.rint if grid.is_cube else np.trunc
-    cells = _cells(-u, v, shape, grid.cell_rad, to_cell)
-    counts = comm.allreduce(_count(cells, _cells(u, -v, shape, grid.cell_rad, to_cell), weights, shape[0] * shape[1]))
-    if not counts.any():
-        raise ValueError(f"npixels = {weighting.npixels} leaves no sample in the uv grid: take 0 or more")
-    density = counts[cells]
-    if weighting.weighting == "uniform":
-        return density
-    scale = (5.0 * 10.0**-weighting.robust) ** 2 * counts.sum() / np.square(counts).sum()
-    return np.where(density > 0, density * scale + 1.0, 0.0)
 
 
 def _weights_by_field(visibilities, grid, weighting, comm):
@@ -160,7 +210,8 @@ def sum_of_weights(visibilities, weights, stokes="I"):
     """tclean's `.sumwt`: each sample of Stokes I counts once for each parallel-hand correlation in its mean."""
     if stokes != "I":
         return float(weights.sum(dtype=float))
-    return float(np.dot(weights, visibilities.rows.hands[visibilities.row].astype(float)))
+    return sum(float(np.dot(weights[piece], part.rows.hands[part.row].astype(float)))
+               for piece, part in visibilities.parts())
 
 
 def dirty_image(operator, vis, weights, comm=SERIAL):
@@ -172,8 +223,8 @@ def dirty_image(operator, vis, weights, comm=SERIAL):
     ----------
     operator : MeasurementOperator, without whitening
         The measurement operator without weights.
-    vis : complex (M,), or 1
-        Jy.
+    vis : complex (M,), 1 or callable
+        Jy; or, of an operator in pieces, what returns them from a slice and its operator.
     weights : real (M,)
         Imaging weights.
     comm : casa_sara.parallel.serial.Serial or MPI
@@ -186,7 +237,13 @@ def dirty_image(operator, vis, weights, comm=SERIAL):
     total = comm.total(float(weights.sum(dtype=np.float64)))
     if not total > 0:
         raise ValueError("the imaging weights of all samples are zero: weighting, npixels or uvtaper leave nothing")
-    return operator.adjoint(weights * vis) / operator.dtype.type(total)
+    weighted = partial(_weighted, weights, vis) if callable(vis) else weights * vis
+    return operator.adjoint(weighted) / operator.dtype.type(total)
+
+
+def _weighted(weights, vis, piece, operator):
+    """Return the weighted visibilities of a slice."""
+    return weights[piece] * vis(piece, operator)
 
 
 def _imager_grid(name, strings, side, cell):
@@ -205,19 +262,26 @@ def _imager_grid(name, strings, side, cell):
         im.done()
 
 
-def _field_uv(visibilities, frame):
-    """Return float32 u, v (M,) in wavelengths at the centre of the field that was observed.
-
-    `frame` is that of the frequencies: 'data', as they stand in the MeasurementSets, or 'LSRK'.
-    """
+def _row_uvw(visibilities):
+    """Return the baselines in metres of every row, float64 (3, R)."""
     rows = visibilities.rows
     uvw_m = np.empty((3, rows.row.size))
     for number in np.unique(rows.ms):
         here = rows.ms == number
         with opened("table", visibilities.ms_names[number]) as tb:
             uvw_m[:, here] = tb.getcol("UVW")[:, rows.row[here]]
-    if frame == "data":
-        wave_numbers = _channel_wave_numbers(visibilities)
+    return uvw_m
+
+
+def _field_uv(visibilities, of_windows=None, uvw_m=None):
+    """Return float32 u, v (M,) in wavelengths at the centre of the field that was observed.
+
+    `of_windows` are the wave numbers of the channels as they stand in the MeasurementSets; without them they are those
+    of LSRK frequencies. `uvw_m` are the baselines of the rows, where they have been read.
+    """
+    uvw_m = _row_uvw(visibilities) if uvw_m is None else uvw_m
+    if of_windows is not None:
+        wave_numbers = _channel_wave_numbers(visibilities, of_windows)
     else:  # a baseline keeps its length when it is turned to another phase centre
         lengths = np.sqrt(np.square(uvw_m).sum(axis=0))
         wave_numbers = np.sqrt(np.einsum("xm,xm->m", visibilities.uvw, visibilities.uvw))
@@ -226,15 +290,22 @@ def _field_uv(visibilities, frame):
     return tuple((uvw_m[axis, visibilities.row] * wave_numbers).astype(np.float32) for axis in (0, 1))
 
 
-def _channel_wave_numbers(visibilities):
+def _channel_wave_numbers(visibilities, of_windows):
     """Return wavelengths per metre (M,) at the channel frequencies as they are in the data."""
     rows, wave_numbers = visibilities.rows, np.empty(visibilities.size)
+    for (ms, spw), of_channels in of_windows.items():
+        here = ((rows.ms == ms) & (rows.spw == spw))[visibilities.row]
+        wave_numbers[here] = of_channels[visibilities.chan[here]]
+    return wave_numbers
+
+
+def _window_wave_numbers(visibilities):
+    """Return (MeasurementSet, spw) → wavelengths per metre of its channels, as their frequencies are in the data."""
+    of_windows = {}
     for ms, spws in visibilities.spws.items():
         with opened("msmetadata", readable(visibilities.ms_names[ms])) as md:
-            for spw in spws:
-                here = ((rows.ms == ms) & (rows.spw == spw))[visibilities.row]
-                wave_numbers[here] = md.chanfreqs(spw)[visibilities.chan[here]] / SPEED_OF_LIGHT
-    return wave_numbers
+            of_windows |= {(ms, spw): md.chanfreqs(spw) / SPEED_OF_LIGHT for spw in spws}
+    return of_windows
 
 
 def _cells(u, v, shape, cell_rad, to_cell=np.trunc):
