@@ -15,6 +15,7 @@ from casa_sara.operators.subbands import Subbands
 __all__ = ["LARGEST_ERROR", "divided_by_band", "spectral_images", "spectral_index", "with_subbands"]
 
 ARCSEC = np.radians(1 / 3600)
+FEWEST = 200  # samples of a block, whose noise level they give to 4 %
 NARROWEST = 1e-3  # band of which spectra may be solved for
 BEYOND = 0.05  # of the band, where a reference frequency may still be
 LARGEST_ERROR = 0.3  # of a spectral index that is not masked
@@ -58,7 +59,7 @@ def with_subbands(grid, data, plane):
 
 
 def divided_by_band(block_of_sample, infos, data, subbands):
-    """Divide blocks by the parts of the band, so that each part has noise levels of its own.
+    """Divide blocks by the parts of the band, so that each has noise levels of its own, unless one had few samples.
 
     Parameters
     ----------
@@ -78,6 +79,9 @@ def divided_by_band(block_of_sample, infos, data, subbands):
     if subbands is None:
         return block_of_sample, infos
     number = block_of_sample * subbands.count + subbands.band_of(data.freq_hz)
+    parts = np.bincount(number, minlength=len(infos) * subbands.count).reshape(-1, subbands.count)
+    whole = np.where(parts > 0, parts, FEWEST).min(axis=1) < FEWEST
+    number = np.where(whole[block_of_sample], block_of_sample * subbands.count, number)
     found, block_of_sample, samples = np.unique(number, return_inverse=True, return_counts=True)
     divided = []
     for one, size, part in zip(found, samples, np.split(np.argsort(block_of_sample, kind="stable"),
