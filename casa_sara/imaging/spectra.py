@@ -78,16 +78,16 @@ def divided_by_band(block_of_sample, infos, data, subbands):
     """
     if subbands is None:
         return block_of_sample, infos
-    number = block_of_sample * subbands.count + subbands.band_of(data.freq_hz)
-    parts = np.bincount(number, minlength=len(infos) * subbands.count).reshape(-1, subbands.count)
+    number = block_of_sample * subbands.n_terms + subbands.band_of(data.freq_hz)
+    parts = np.bincount(number, minlength=len(infos) * subbands.n_terms).reshape(-1, subbands.n_terms)
     whole = np.where(parts > 0, parts, FEWEST).min(axis=1) < FEWEST
-    number = np.where(whole[block_of_sample], block_of_sample * subbands.count, number)
+    number = np.where(whole[block_of_sample], block_of_sample * subbands.n_terms, number)
     found, block_of_sample, samples = np.unique(number, return_inverse=True, return_counts=True)
     divided = []
     for one, size, part in zip(found, samples, np.split(np.argsort(block_of_sample, kind="stable"),
                                                         np.cumsum(samples)[:-1])):
         freqs = data.freq_hz[part]
-        divided.append(replace(infos[one // subbands.count], samples=int(size),
+        divided.append(replace(infos[one // subbands.n_terms], samples=int(size),
                                band_hz=(float(freqs.min()), float(freqs.max()))))
     return block_of_sample, divided
 

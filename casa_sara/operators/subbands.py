@@ -95,7 +95,7 @@ class Subbands:
                    (float(distinct[0]), float(distinct[-1])))
 
     @property
-    def count(self) -> int:
+    def n_terms(self) -> int:
         """Number of frequencies T."""
         return len(self.freqs_hz)
 
@@ -103,7 +103,7 @@ class Subbands:
     def orders(self) -> np.ndarray:
         """F, float64 (T, T), orthonormal."""
         place = np.log(self.freqs_hz / self.reference_hz)
-        powers = np.sqrt(self.shares)[:, None] * place[:, None] ** np.arange(self.count)
+        powers = np.sqrt(self.shares)[:, None] * place[:, None] ** np.arange(self.n_terms)
         found, triangle = np.linalg.qr(powers)
         return (found * np.sign(np.diag(triangle))).T
 
@@ -120,7 +120,7 @@ class Subbands:
         float64 (T, M)
         """
         place, nodes = np.log(np.asarray(freq_hz, float) / self.reference_hz), np.log(self.freqs_hz / self.reference_hz)
-        out = np.empty((self.count, place.size))
+        out = np.empty((self.n_terms, place.size))
         for t, node in enumerate(nodes):
             others = np.delete(nodes, t)
             out[t] = np.prod((place - others[:, None]) / (node - others)[:, None], axis=0) / np.sqrt(self.shares[t])
@@ -153,7 +153,7 @@ class Subbands:
         -------
         real (T, nx, ny)
         """
-        return stacked.reshape(self.count, -1, stacked.shape[-1])
+        return stacked.reshape(self.n_terms, -1, stacked.shape[-1])
 
     def spectra(self, stacked: np.ndarray) -> np.ndarray:
         """Return I(ν_t) of stacked images z.

@@ -192,7 +192,7 @@ class Problem:
             data_norm_sq = float(comm.bcast(power_method(
                 lambda image: whole.adjoint(precond * whole.forward(image)), measurement.shape, dtype=np.float32)))
         if support is not None and grid.subbands is not None:
-            support = np.tile(support, (grid.subbands.count, 1))
+            support = np.tile(support, (grid.subbands.n_terms, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
                    grid.mosaic and grid.mosaic.over, dish, grid.subbands)
 

@@ -70,8 +70,8 @@ class Solution:
         measurement, samples = problem.measurement, problem.samples
         nx, ny = measurement.shape
         subbands, planes = problem.subbands, _planes(problem.subbands, options.positivity)
-        dictionary: Any = SaraDictionary((nx // planes.count, ny), ranks.wavelets(options.wavelets), options.wavelevels,
-                                         nthreads=options.nthreads, n_bases=len(options.wavelets))
+        dictionary: Any = SaraDictionary((nx // planes.n_planes, ny), ranks.wavelets(options.wavelets),
+                                         options.wavelevels, nthreads=options.nthreads, n_bases=len(options.wavelets))
         if subbands is not None:
             dictionary = SubbandDictionary(dictionary, subbands.orders)
         if options.method == PAPER:

@@ -343,7 +343,7 @@ class AdaptivePPD:
         sums = [*sums.tolist(), float(greatest)]
         change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
-        if self.planes.count > 1:
+        if self.planes.n_planes > 1:
             seen = self.planes.at_reference(self.model)
             self.model_flux, self.model_max = float(seen.sum(dtype=float)), float(seen.max())
         if self.sky_over_image is not None:

@@ -83,7 +83,7 @@ def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confin
 def _band_scales(ppd, noise, pixel):
     """ν of every band: of slopes and higher orders of spectra twice as much, as they are smaller than the mean."""
     scales = np.maximum(noise / pixel, 1.0)
-    if ppd.planes.count > 1:
+    if ppd.planes.n_planes > 1:
         scales[[band.order > 0 for band in ppd.dictionary.bands()]] *= SLOPES
     return scales
 

@@ -31,7 +31,7 @@ class Planes:
         self._positivity = positivity
 
     @property
-    def count(self) -> int:
+    def n_planes(self) -> int:
         """T."""
         return len(self.roots)
 
@@ -47,7 +47,7 @@ class Planes:
         -------
         (T, nx, ny)
         """
-        return stacked.reshape(self.count, -1, stacked.shape[-1])
+        return stacked.reshape(self.n_planes, -1, stacked.shape[-1])
 
     def mean(self, stacked: np.ndarray) -> np.ndarray:
         """Return Σ r_t z_t, of all images what the data see as one.
@@ -76,12 +76,12 @@ class Planes:
         real (nx, ny)
         """
         image = self._combined(self._reference, stacked)
-        if self._positivity and self.count > 1:
+        if self._positivity and self.n_planes > 1:
             np.maximum(image, 0, out=image, where=self.split(stacked).min(axis=0) >= 0)
         return image
 
     def _combined(self, factors, stacked):
-        if self.count == 1:
+        if self.n_planes == 1:
             return stacked
         return np.tensordot(factors.astype(stacked.dtype), self.split(stacked), 1)
 
@@ -97,7 +97,7 @@ class Planes:
         -------
         real (T·nx, ny)
         """
-        if self.count == 1:
+        if self.n_planes == 1:
             return image
         return (self.roots.astype(image.dtype)[:, None, None] * image).reshape(-1, image.shape[-1])
 
@@ -113,7 +113,7 @@ class Planes:
         -------
         bool (T·nx, ny)
         """
-        return pixels if self.count == 1 else np.tile(pixels, (self.count, 1))
+        return pixels if self.n_planes == 1 else np.tile(pixels, (self.n_planes, 1))
 
     def points(self, points: PointSources, shape: tuple[int, ...]) -> PointSources:
         """Return the same points in every plane, each with a flux of its own.
@@ -129,9 +129,9 @@ class Planes:
         -------
         PointSources
         """
-        if self.count == 1:
+        if self.n_planes == 1:
             return points
-        steps = np.arange(self.count)[:, None, None] * [shape[0] // self.count, 0]
+        steps = np.arange(self.n_planes)[:, None, None] * [shape[0] // self.n_planes, 0]
         return PointSources((points.places + steps).reshape(-1, 2))
 
     def set_pixel(self, stacked: np.ndarray, place: Sequence[int]) -> None:
