@@ -80,6 +80,14 @@ def test_large_scan_is_cut_by_size_at_integrations():
     assert all(len(blocks) == 1 for blocks in blocks_of_time.values())
 
 
+def test_size_alone_makes_a_limited_number_of_blocks(monkeypatch):
+    vis = observation([(0, 0, 1, 0, 50), (0, 0, 2, 1000, 10)], baselines=100, channels=64)
+    for most, expected in ((64, [80_000] * 4 + [64_000]), (2, [160_000] * 2 + [64_000])):
+        monkeypatch.setattr(module, "CUT_FOR_SIZE", most)
+        infos = snapshot_blocks(vis)[1]
+        np.testing.assert_allclose([info.samples for info in infos], expected, atol=6400)
+
+
 def test_a_single_integration_stays_whole():
     assert len(snapshot_blocks(observation([(0, 0, 1, 0, 1)], baselines=300, channels=512))[1]) == 1
 

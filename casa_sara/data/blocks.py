@@ -15,6 +15,7 @@ __all__ = ["snapshot_blocks"]
 
 SNAPSHOT_SECONDS = 1800.0
 SNAPSHOT_SAMPLES = 100_000
+CUT_FOR_SIZE = 64  # blocks that numbers of samples alone make at most
 SMALLEST_SNAPSHOT = 500
 SESSION_GAP_SECONDS = 12 * 3600.0
 
@@ -27,8 +28,8 @@ def snapshot_blocks(visibilities: Visibilities, blocks: int = 0, group: np.ndarr
 
     1. one block for each scan of each observation of each MeasurementSet (and for each
        session of it: a gap of 12 h starts a new one);
-    2. a scan longer than 30 min, or of more than 1e5 samples, is cut into equal spans of
-       time, as many as bring it below both limits; an integration is never cut;
+    2. a scan longer than 30 min, or of more than 1e5 samples and 1/64 of all, is cut into
+       equal spans of time, as many as bring it below both limits; an integration is never cut;
     3. a block of fewer than 500 samples is joined to the neighbour nearer in time, the
        smallest first, as long as the session has one: a bound from few samples says little.
 
@@ -225,7 +226,8 @@ def _time_spans(scan, time, samples):
     start, end = _extents(scan, time)
     length = end - start
     total = np.bincount(scan, weights=samples)
-    spans = np.ceil(np.maximum(np.maximum(length / SNAPSHOT_SECONDS, total / SNAPSHOT_SAMPLES), 1)).astype(int)
+    most = max(SNAPSHOT_SAMPLES, total.sum() / CUT_FOR_SIZE)
+    spans = np.ceil(np.maximum(np.maximum(length / SNAPSHOT_SECONDS, total / most), 1)).astype(int)
     along = (time - start[scan]) / np.where(length > 0, length, 1)[scan]
     return np.minimum(np.floor(along * spans[scan]).astype(int), spans[scan] - 1)
 
