@@ -18,6 +18,7 @@ from casa_sara.solver.point_sources import PointSources
 __all__ = ["FEATURE_DRAWS", "FeatureResult", "FeatureTest"]
 
 FEATURE_DRAWS = 20
+SETTLED, MOST_TO_SETTLE = 5.0, 6  # fall of χ² within a solution, before the first draw, and most solutions until then
 LEAST_P = 1e-300
 
 
@@ -130,6 +131,8 @@ class FeatureTest:
             draw_noise(ppd, np.random.default_rng([SEED, 1, number]), self._bounds.noise, noise)
             np.add(predicted, noise, out=ppd.vis)
             progress(number)
+            if number == 0:
+                self._forget(supports[0], points, stopped)
             drawn.append(self._change(supports, points, stopped)[0])
         without, with_ = (model * np.float32(ppd.unit_jy) for model in (without, with_))
         return FeatureResult(change, np.array(drawn), float(with_[region].sum(dtype=float)), without, with_)
@@ -139,12 +142,25 @@ class FeatureTest:
         without, with_ = supports
         chi_squares, models = [], []
         for support in (without, with_, without):
-            self._ppd.support_only(support, points)
-            self._ppd.start_from(self._ppd.model)
-            self._solve(stopped)
-            chi_squares.append(self._chi_square())
+            chi_squares.append(self._solved(support, points, stopped))
             models.append(self._ppd.model.copy())
         return 0.5 * (chi_squares[0] + chi_squares[2]) - chi_squares[1], models[2], models[1]
+
+    def _forget(self, support, points, stopped):
+        """Solve until the dual variables hold nothing any more of what the data had in the region."""
+        before = np.inf
+        for _ in range(MOST_TO_SETTLE):
+            now = self._solved(support, points, stopped)
+            if before - now < SETTLED:
+                break
+            before = now
+
+    def _solved(self, support, points, stopped):
+        """Solve within a support, from the present model, and return χ²."""
+        self._ppd.support_only(support, points)
+        self._ppd.start_from(self._ppd.model)
+        self._solve(stopped)
+        return self._chi_square()
 
     def _solve(self, stopped):
         """The problems of a draw, with weights found anew between them."""

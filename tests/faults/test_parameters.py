@@ -17,6 +17,7 @@ casatools = pytest.importorskip("casatools")
 from simulated_ms import simulate
 
 from casa_sara import saracompare, tsara
+from casa_sara.demo.single_dish import dish_image
 from casa_sara.private.parameters import SARACOMPARE, TSARA
 
 REFUSALS = (ValueError, TypeError, OSError, MemoryError)  # OSError: a path that is not there, or not to be written
@@ -59,7 +60,7 @@ def opened(parameters, name):
         return {}
     closed = parameter.open_unless
     opener = next(other for other in parameters if other.name == parameter.opener)
-    value = parameter.open_on[-1] if parameter.open_on else opener.default
+    value = parameter.open_on[-1] if parameter.open_on else opener.default or "dish.image"
     assert value not in closed
     return {parameter.opener: value}
 
@@ -119,6 +120,8 @@ def test_tsara_names_the_parameter_that_it_refuses(vis, tmp_path, parameter):
     call = dict(vis=str(own), imagename="out", niter=2, overwrite=True, **SMALL) | opened(TSARA, parameter.name)
     if call.get("databound") == "fixed":
         call["l2bound"] = 1.0
+    if "sdimage" in call:
+        dish_image(call["sdimage"], np.ones((20, 20)), 4.0, (299.86875, 40.733889), 20.0, 8.4e9)
 
     @bounded(parameter)
     @given(values_of(parameter))
