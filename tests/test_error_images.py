@@ -320,6 +320,7 @@ def test_draws_of_another_image_and_damaged_ones_are_refused(vis, folder):
 
 # features of saracompare
 
+@pytest.mark.slow
 def test_a_source_is_real_and_nothing_is_not(whole, vis, folder):
     features = ["third = 19h59m28.588s +40d44m03.5s 3arcsec", "nothing = 19h59m28.1s +40d43m48s 3arcsec"]
     models, noise = [str(folder / "whole"), str(folder / "plain")], whole[0]["sara"]["chosen"]["noise_jy_per_beam"]

@@ -156,6 +156,7 @@ def test_a_source_is_real_where_it_is_and_not_beside():
     np.testing.assert_array_equal(result.model, plain.model)
 
 
+@pytest.mark.slow
 def test_where_nothing_is_p_values_are_anything():
     """Twelve places in three noise realisations: about as many p-values below one half as above, and none tiny."""
     noise = NOISE_JY / np.sqrt(4800)

@@ -281,6 +281,7 @@ def test_one_pointing_is_the_standard_image_over_its_beam(folder, tmp_path, monk
 # The sky ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_sources_are_recovered_in_place_and_flux(mixed, tmp_path, monkeypatch):
     """At the centre of a pointing, between pointings, and where the beam of the mosaic is 0.2."""
     monkeypatch.chdir(tmp_path)
