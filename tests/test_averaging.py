@@ -221,6 +221,7 @@ def test_cells_respect_w_and_frequency():
 
 # solutions
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_db", [20, 40, 60])
 def test_the_solution_is_that_of_all_samples_within_a_tenth_of_the_noise(noise_db):
     """Points in the centre and in the corners, each in its own pixel; rms of four observations."""

@@ -71,6 +71,7 @@ def test_every_draw_is_the_solution_of_its_data():
         assert error < 0.01, number
 
 
+@pytest.mark.slow
 def test_every_solution_of_a_jackknife_lacks_its_blocks():
     """√(g − 1)(x_k − x̂), with x_k and x̂ of least squares; six blocks in four groups."""
     problem, noise_weights, draws = drawn_from_dense_problem(4, Jackknife, (30, 40, 50, 60, 70, 80), 3 * (0.05, 0.1))

@@ -152,6 +152,7 @@ def test_dirty_cube_of_another_stokes_is_tcleans(tmp_path, stokes):
     np.testing.assert_allclose(image("ours.sumwt")[0], image("clean.sumwt")[0], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_model_column_holds_each_channel_of_its_own(line, tmp_path):
     """Against an explicit sum over the pixels of each channel; what is in no channel of the image is 0."""
     vis = str(tmp_path / "copy.ms")

@@ -137,6 +137,7 @@ def image_and_test(sources, seed, places, draws=10):
     return result, found
 
 
+@pytest.mark.slow
 def test_a_source_is_real_where_it_is_and_not_beside():
     """S/N 8 at (30.3, 30); the bright source beside is 500 times as strong."""
     noise = NOISE_JY / np.sqrt(4800)

@@ -394,6 +394,7 @@ def test_what_was_not_measured_is_left_out(full):
     assert made[1].rows == (("tsara and tclean briggs", "∞"),)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CHROMIUM, reason="no Chromium to render the page")
 @pytest.mark.parametrize("width", [1024, 1400])
 def test_page_fits_the_window(report, width, tmp_path):
