@@ -118,8 +118,12 @@ def test_the_log_tells_of_the_draws_and_of_the_errors_of_fluxes(whole):
     assert any(f"{first['flux_jy']:.4g} +- {first['bootstrap_error_jy']:.2g} Jy" in line for line in lines)
 
 
-def test_the_image_is_that_without_draws(vis, whole, folder):
-    plain, _ = image(vis, folder / "plain", ndraws=0)
+@pytest.fixture(scope="module")
+def plain(vis, folder):
+    return image(vis, folder / "plain", ndraws=0)[0]
+
+
+def test_the_image_is_that_without_draws(whole, plain, folder):
     np.testing.assert_array_equal(pixels(folder / "plain.model"), pixels(folder / "whole.model"))
     assert "draws" not in plain["sara"] and "bootstrap_error_jy" not in plain["sara"]["islands"][0]
     assert not any(os.path.exists(f"{folder / 'plain'}{suffix}") for suffix in EXTRA)
@@ -321,7 +325,7 @@ def test_draws_of_another_image_and_damaged_ones_are_refused(vis, folder):
 # features of saracompare
 
 @pytest.mark.slow
-def test_a_source_is_real_and_nothing_is_not(whole, vis, folder):
+def test_a_source_is_real_and_nothing_is_not(whole, plain, vis, folder):
     features = ["third = 19h59m28.588s +40d44m03.5s 3arcsec", "nothing = 19h59m28.1s +40d43m48s 3arcsec"]
     models, noise = [str(folder / "whole"), str(folder / "plain")], whole[0]["sara"]["chosen"]["noise_jy_per_beam"]
     found = saracompare(models=models, vis=vis, datacolumn="data", features=features,
