@@ -60,8 +60,8 @@ def run(folder: Path) -> None:
     print(f"\n{text}\n\n  report: {page}")
     print("  the same test of a sky without the companion …", flush=True)
     test = _test_without_companion(case, sky)
-    print(f"  flux {1e3 * test['flux_jy']:.1f} mJy, chi-square without it larger by {test['delta_chi_square']:.1f}, "
-          f"p = {test['p_value']:.2g}")
+    print(f"  {1e3 * test['flux_jy']:.2f} mJy at its place, without which chi-square is larger by "
+          f"{test['delta_chi_square']:.1f}: p = {test['p_value']:.2g}")
 
 
 def _coarser(case: Case) -> Case:
