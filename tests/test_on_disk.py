@@ -167,6 +167,24 @@ def test_the_solution_of_enlarged_cells_is_that_of_all_samples_within_a_tenth_of
     assert np.sqrt(np.mean(np.square(different), axis=0)).max() < 0.1
 
 
+def test_the_correction_follows_the_multipliers(monkeypatch):
+    """It is a part of Σ_j λ_j Φ_j†(y_j − Φ_j x): twice as large with twice the multipliers, and with twice κ."""
+    enlarged(monkeypatch, 1)
+    seen = []
+
+    def then(ppd, bounds, record):
+        for change in (lambda: None, lambda: ppd.penalise(2 * ppd.multipliers), lambda: ppd.rescale(2 * ppd.threshold)):
+            change()
+            seen.append((ppd.correction.copy(), ppd.multipliers.copy()))
+
+    reconstruct(observed(20)[0], GRID, replace(OPTIONS, niter=20), control=Control(then=then))
+    (first, multipliers), *others = seen
+    assert np.abs(first).max() > 0
+    for factor, (correction, now) in zip((2, 4), others):
+        np.testing.assert_allclose(now, factor * multipliers, rtol=1e-12)
+        np.testing.assert_allclose(correction, factor * first, rtol=1e-6)
+
+
 def test_cells_are_enlarged_where_there_are_more_averages_than_pixels(monkeypatch):
     samples, _ = observed(20)
     told = []
