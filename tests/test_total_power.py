@@ -2,6 +2,7 @@
 
 import os
 import signal
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -50,6 +51,24 @@ def explicit(image, places):
 
 
 # The operator -----------------------------------------------------------------------------------
+
+
+def test_a_call_allocates_nothing():
+    """Neither of the image nor of the grid of many points, beside the buffers of NumPy."""
+    shape, beam = (600, 500), GaussianBeam(5e-5, 5e-5, 0.0)
+    operator = SingleDishOperator(Points.within(shape, CELL, beam.width), beam, shape, CELL, np.ones(shape))
+    image, vis = np.ones(shape, np.float32), np.empty(operator.size, np.complex64)
+    assert vis.nbytes > 200_000
+
+    def both():
+        operator.adjoint(operator.forward(image, vis), image)
+
+    both()
+    tracemalloc.start()
+    both()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 70_000
 
 
 @pytest.mark.parametrize("dtype, accuracy", [(np.float64, 1e-6), (np.float32, 2e-6)])

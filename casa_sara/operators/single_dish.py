@@ -250,7 +250,7 @@ class SingleDishOperator:
                  scale: float = 1.0, dtype: npt.DTypeLike = np.float32, nthreads: Any = 1) -> None:
         self.shape, self.size, self.dtype = tuple(shape), (points.size + 1) // 2, np.dtype(dtype)
         self.complex_dtype = np.result_type(self.dtype, np.complex64)
-        self._points, self._chosen = points.size, points.chosen
+        self._points, self._places = points.size, np.flatnonzero(points.chosen)
         periods = [n * cell + beam.reach for n, cell in zip(shape, cell_rad)]
         u, v = (np.arange(-count, count + 1) / period
                 for period, count in ((period, int(np.ceil(beam.finest * period))) for period in periods))
@@ -262,8 +262,12 @@ class SingleDishOperator:
         self._passed = (weight * beam.transform(*modes)).reshape(u.size, v.size).astype(self.complex_dtype)
         self._east, self._north = (np.exp(-2j * np.pi * np.outer(*pair)).astype(self.complex_dtype)
                                    for pair in ((points.east, u), (v, points.north)))
-        self._modes = np.empty(modes.shape[1], self.complex_dtype)
-        self._grid = np.zeros(points.chosen.shape, self.dtype)
+        self._adjoints = [np.ascontiguousarray(array.conj().T) for array in (self._east, self._north)]
+        self._passed_conj = self._passed.conj()
+        self._modes = np.empty((u.size, v.size), self.complex_dtype)
+        self._half, self._half_back = (np.empty(pair, self.complex_dtype)
+                                       for pair in ((points.east.size, v.size), (u.size, points.north.size)))
+        self._grid, self._values = (np.zeros(points.chosen.shape, dtype) for dtype in (self.complex_dtype, self.dtype))
         self._over = None if over is None else np.asarray(over, self.dtype)
         self._image = np.empty(self.shape if over is not None else (0, 0), self.dtype)
 
@@ -285,11 +289,13 @@ class SingleDishOperator:
         image, out = for_forward(self, image, out)
         if self._over is not None:
             image = np.multiply(image, self._over, out=self._image)
-        modes = self._transform.forward(image, self._modes).reshape(self._passed.shape)
-        modes *= self._passed
+        self._transform.forward(image, self._modes.reshape(-1))
+        self._modes *= self._passed
+        np.matmul(np.matmul(self._east, self._modes, out=self._half), self._north, out=self._grid)
+        self._values[...] = self._grid.real
         values = out.view(self.dtype)
         values[self._points:] = 0
-        values[:self._points] = (self._east @ modes @ self._north).real[self._chosen]
+        self._values.take(self._places, out=values[:self._points], mode="clip")
         return out
 
     def adjoint(self, vis: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
@@ -307,10 +313,12 @@ class SingleDishOperator:
         real (nx, ny)
         """
         vis, out = for_adjoint(self, vis, out)
-        self._grid[self._chosen] = vis.view(self.dtype)[:self._points]
-        modes = self._east.conj().T @ self._grid @ self._north.conj().T
-        modes *= self._passed.conj()
-        self._transform.adjoint(modes.ravel(), out)
+        east, north = self._adjoints
+        self._grid.fill(0)
+        self._grid.reshape(-1)[self._places] = vis.view(self.dtype)[:self._points]
+        np.matmul(np.matmul(east, self._grid, out=self._half_back), north, out=self._modes)
+        self._modes *= self._passed_conj
+        self._transform.adjoint(self._modes.reshape(-1), out)
         if self._over is not None:
             out *= self._over
         return out
