@@ -7,9 +7,7 @@ from pathlib import Path
 from casa_sara.analysis import cube_pictures
 from casa_sara.analysis.cube_comparison import CubeComparison
 from casa_sara.analysis.cube_tables import cube_tables
-from casa_sara.analysis.folder import MEASURES, PAGE, replaced
-from casa_sara.analysis.report import Picture, page
-from casa_sara.runtime import jsonfile
+from casa_sara.analysis.report import Picture, write_page
 
 __all__ = ["write_cube_report"]
 
@@ -43,13 +41,7 @@ def write_cube_report(comparison: CubeComparison, folder: Path, title: str = "SA
     FileExistsError
         A file that is not of an earlier report has the name of one of the report's.
     """
-    folder = Path(folder)
-    with replaced(folder) as new:
-        jsonfile.save(new / MEASURES, comparison.measures)
-        pictures = [*_line(comparison, new), *_channels(comparison, new), *_noise(comparison, new)]
-        shown = page(comparison, title, pictures, cube_tables(comparison))
-        (new / PAGE).write_text(shown, encoding="utf-8")
-    return folder / PAGE
+    return write_page(comparison, folder, title, (_line, _channels, _noise), cube_tables)
 
 
 def _line(comparison, folder) -> list[Picture]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,13 +81,36 @@ def write_report(comparison: Comparison, folder: Path, title: str = "SARA imagin
     FileExistsError
         A file that is not of an earlier report has the name of one of the report's.
     """
+    return write_page(comparison, folder, title, (_sky, _errors, _frames, _residuals, _runs), tables)
+
+
+def write_page(comparison: Comparison | CubeComparison, folder: Path, title: str,
+               sections: Sequence[Callable[..., list[Picture]]], tables_of: Callable[..., list[Table]]) -> Path:
+    """Write a report as :func:`write_report` does, of given sections.
+
+    Parameters
+    ----------
+    comparison : Comparison or CubeComparison
+        What it is about.
+    folder : Path
+        Made if it is not there.
+    title : str
+        Heading of the page.
+    sections : sequence of callable
+        Each draws its pictures: called with the comparison and the folder, it returns a list of `Picture`.
+    tables_of : callable
+        Called with the comparison, it returns a list of `Table`.
+
+    Returns
+    -------
+    Path
+        Of report.html.
+    """
     folder = Path(folder)
     with replaced(folder) as new:
         jsonfile.save(new / MEASURES, comparison.measures)
-        pictures = [*_sky(comparison, new), *_errors(comparison, new), *_frames(comparison, new),
-                    *_residuals(comparison, new), *_runs(comparison, new)]
-        shown = page(comparison, title, pictures, tables(comparison))
-        (new / PAGE).write_text(shown, encoding="utf-8")
+        pictures = [picture for draw in sections for picture in draw(comparison, new)]
+        (new / PAGE).write_text(page(comparison, title, pictures, tables_of(comparison)), encoding="utf-8")
     return folder / PAGE
 
 

@@ -152,7 +152,7 @@ def _passed_over():
     try:
         yield
     except CheckpointError as error:
-        log.info(f"passed over: {error}")
+        log.info(f"a checkpoint beside is not of this run, and is not used: {error}")
 
 
 def _numbered(checkpoint, number):

@@ -141,20 +141,6 @@ class Subbands:
         middles = np.sqrt(self.freqs_hz[1:] * self.freqs_hz[:-1])
         return np.searchsorted(middles, freq_hz)
 
-    def split(self, stacked: np.ndarray) -> np.ndarray:
-        """Return stacked images as an array (T, nx, ny), without a copy.
-
-        Parameters
-        ----------
-        stacked : real (T·nx, ny)
-            z.
-
-        Returns
-        -------
-        real (T, nx, ny)
-        """
-        return stacked.reshape(self.n_terms, -1, stacked.shape[-1])
-
     def spectra(self, stacked: np.ndarray) -> np.ndarray:
         """Return I(ν_t) of stacked images z.
 
@@ -167,7 +153,8 @@ class Subbands:
         -------
         real (T, nx, ny)
         """
-        return self.split(stacked) / np.sqrt(self.shares).astype(stacked.dtype)[:, None, None]
+        brightness = stacked.reshape(self.n_terms, -1, stacked.shape[-1])
+        return brightness / np.sqrt(self.shares).astype(stacked.dtype)[:, None, None]
 
     def stacked(self, spectra: np.ndarray) -> np.ndarray:
         """Return z of images I(ν_t), or of one image that is the same at all frequencies.

@@ -220,7 +220,7 @@ class Problem:
         float
         """
         if self.subbands is not None:
-            fluxes = np.abs(self.subbands.split(image)).sum(axis=(1, 2), dtype=float)
+            fluxes = np.abs(image).reshape(self.subbands.n_terms, -1).sum(axis=1, dtype=float)
             return self.unit_jy * float((np.abs(self.subbands.factors(self.subbands.band_hz)).T @ fluxes).max())
         sky = image if self.sky_over_image is None else image * self.sky_over_image
         return self.unit_jy * float(np.abs(sky).sum(dtype=float))
