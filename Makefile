@@ -9,10 +9,12 @@ python := $(abspath $(VENV))/bin/python
 .PHONY: test test-slow test-all lint coverage demo docs install tasks dist clean
 
 # make test COVERAGE=1, or make coverage, reports which lines the tests reach. Compiled kernels are not seen.
+# make test JOBS=4: in four processes, each with whole files of tests.
+JOBS ?= 2
 cover = $(if $(COVERAGE),--cov=casa_sara --cov-append --cov-report=term:skip-covered)
 
 test: install
-	$(python) -m pytest -m "not slow" $(cover) $(TESTS)
+	$(python) -m pytest -m "not slow" --numprocesses $(JOBS) --dist loadfile $(cover) $(TESTS)
 
 # The tests that take longest; test-all runs both.
 test-slow: install
