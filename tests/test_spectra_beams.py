@@ -11,10 +11,11 @@ casatools = pytest.importorskip("casatools")
 
 import casa_sara.imaging.spectra as spectra_module
 from casa_sara import tsara
+from casa_sara.comparison.compare_images import compare_images
 from casa_sara.operators.beams import Beam, Mosaic
 from casa_sara.operators.sky import sky_operator
 from casa_sara.operators.subbands import Subbands
-from casa_sara.options import ImageGrid
+from casa_sara.options import Comparing, ImageGrid, Selection
 
 INDEX, REFERENCE = -0.7, 100e9
 WINDOWS = (("84GHz", "10.6GHz", 4),)
@@ -120,3 +121,10 @@ def test_index_and_flux_are_those_of_the_sky(run):
     assert not known[2, 2]
     islands = result["sara"]["islands"]
     assert len(islands) == 3 and all(one["flux_jy"] == pytest.approx(1, rel=0.02) for one in islands)
+
+
+@pytest.mark.slow
+def test_comparison_sees_the_spectra_through_the_beams(run, vis):
+    request = Comparing((run[1],), ("spectra",))
+    measures = compare_images(request, Selection((vis,), datacolumn="data"), single=True).measures["products"]
+    assert max(measures["spectra"]["natural"]["chi_square"]) < 1.2
