@@ -134,7 +134,9 @@ class AdaptivePPD:
     sky_over_image : real (nx, ny) or None
         Of a mosaic, by which the model is multiplied to be the sky, for the record.
     planes : Planes
-        Those of which (nx, ny) are stacked here, where the sky is solved for at several frequencies.
+        The images that are stacked here, (nx, ny) being of all together: of several frequencies, or of several parts of
+        the sky. Flux and maximum are then those of what was asked for, and σ is that of all or of the main image,
+        whichever is larger.
     """
 
     def __init__(self, measurement: Measurement, dictionary: Prior,  # noqa: PLR0913 - Φ, Ψ, y, U of the paper
@@ -334,15 +336,21 @@ class AdaptivePPD:
         self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, *gradients, steps,
                                      self.lowest, self._sums, part=self.comm.part)
         self.comm.barrier()
-        sums, greatest = self._sums[:, :3].sum(axis=0), self._sums[:, 3].max()
+        of_parts = np.array([self._sums[part, :3].sum(axis=0) for part in self.planes.parts])
+        greatest = self._sums[:, 3].max()
         if len(self.points):
             if self.comm.part[0] == 0:
-                sums += self.points.project(self.model, self.anchor, self.model_bar, points_before)
+                of_parts += self.points.project(self.model, self.anchor, self.model_bar, points_before,
+                                                self.planes.places(self.points))
             self.comm.barrier()
-            sums, greatest = np.maximum(sums, (0, 0, -np.inf)), self.model.max()
-        sums = [*sums.tolist(), float(greatest)]
+            of_parts, greatest = np.maximum(of_parts, (0, 0, -np.inf)), self.model.max()
+        sums = [*of_parts.sum(axis=0).tolist(), float(greatest)]
         change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
-        self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
+        self.rel_change = _relative_change(change, norm)
+        if len(of_parts) > 1:  # what is bright elsewhere must not hide that the main image still changes
+            main = self.planes.main(self.model)
+            self.rel_change = max(self.rel_change, _relative_change(*of_parts[0, :2]))
+            self.model_flux, self.model_max = float(of_parts[0, 2]), float(main.max())
         if self.planes.n_planes > 1:
             seen = self.planes.at_reference(self.model)
             self.model_flux, self.model_max = float(seen.sum(dtype=float)), float(seen.max())
@@ -442,3 +450,8 @@ class AdaptivePPD:
         self.l2_bounds = np.array(state["l2_bounds"])
         self.points = PointSources(state["points"])
         self.correction = None if state.get("correction") is None else np.array(state["correction"])
+
+
+def _relative_change(change_sq, norm_sq):
+    """σ, from Σ(x⁺ − x)² and Σ(x⁺)²."""
+    return float(np.sqrt(change_sq / norm_sq)) if norm_sq > 0 else float(change_sq > 0)
