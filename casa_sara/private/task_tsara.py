@@ -214,7 +214,6 @@ def _refuse_for_mosaics(parameters):
         return
     for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
                                 ("parallel", False, "a mosaic takes one process"),
-                                ("report", False, "reports are made of single pointings only"),
                                 ("ndraws", 0, "errors by bootstrap are of single pointings only"),
                                 ("jackknife", False, "errors by jackknife are of single pointings only")):
         if parameters[name] != right:
@@ -248,8 +247,10 @@ def _refuse_for_spectra(parameters):
         raise ValueError(f"nterms = {nterms}: should be from 1 to {MOST_TERMS}")
     if nterms == 1:
         return
-    for name, right, reason in (("gridder", "standard", "other operators are of flat, or of known spectra"),
-                                ("method", "tsara", "the paper's method has one image"),
+    if parameters["gridder"] == "wproject":
+        raise ValueError(f"gridder = 'wproject' with nterms = {nterms}: the w-term is modelled of flat, or of known "
+                         "spectra; should be 'standard' or 'mosaic'")
+    for name, right, reason in (("method", "tsara", "the paper's method has one image"),
                                 ("stokes", "I", "spectra are those of the brightness"),
                                 ("positivity", True, "the brightness is positive at all frequencies"),
                                 ("spectralindex", "", "either the index is known, or it is solved for"),
