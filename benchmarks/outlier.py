@@ -185,7 +185,7 @@ def cleaned(folder, case, vis, name, with_file, setting):
     with quiet(folder / f"{name}.log"):
         tclean(vis=vis, imagename=str(folder / name), weighting="briggs", robust=0.5, deconvolver="multiscale",
                scales=sorted({round(scale * 4.7) for scale in scales}), smallscalebias=bias, niter=niter, gain=gain,
-               nsigma=2.0, pblimit=-0.1, cyclefactor=1.5, wprojplanes=64 if case.gridder == "wproject" else 1,
+               nsigma=2.0, pblimit=-1e-9, cyclefactor=1.5, wprojplanes=64 if case.gridder == "wproject" else 1,
                outlierfile=outlier_file(folder, case, name) if with_file else "", **case.grid)
     seconds, beam = time.perf_counter() - begin, read_image(str(folder / name) + ".image")[1]
     return [read_image(str(folder / name) + kind)[0] for kind in (".model", *["_far.model"] * with_file)], beam, seconds

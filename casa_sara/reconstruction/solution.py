@@ -184,7 +184,8 @@ def begin(samples: Samples, problem_of: Callable[..., Problem], options: SolverO
         solution = Solution.of(problem, found, options, ranks)
         found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
         model = first if startmodel is None else startmodel
-        threshold = STEP_BALANCE * _mean_brightness(model)
+        main = solution.ppd.planes.main(model)
+        threshold = STEP_BALANCE * _mean_brightness(main if main.any() else model)
     solution.ppd.start_from(model)
     solution.ppd.rescale(threshold)
     return solution
