@@ -8,7 +8,8 @@ Two observations with the same noise: of the field alone, and with the double be
 field. Visibilities are type-3 non-uniform transforms, exact with w, of a sky on pixels half as large as those of the
 image. The field is imaged from the first (`alone`), and from the second with the outlier file and without it. SNR =
 20 log10(‖truth‖/‖truth − model‖) of the field smoothed to half and to one beam. tclean runs multiscale, with the same
-file; of GRID, that with the best SNR at half a beam is shown.
+file and pblimit=-1, without which it does nothing outside the primary beam; of GRID, that with the best SNR at half a
+beam is shown.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ OUTLIER = 96  # pixels
 NOISE = 0.005  # Jy, of a visibility of one correlation
 # of the double: flux, place in pixels of the outlier's image, FWHM in pixels
 DOUBLE = ((1.4, 3.3, -2.6, 0.0), (0.6, -9.0, 5.0, 6.0))
+THRESHOLD = "25uJy"  # of tclean, twice the noise of the images
 # scales in beams, bias towards small ones, most iterations, gain
 GRID = {"short": ((0, 1, 3), 0.0, 3000, 0.2), "long": ((0, 1, 3, 8), 0.6, 20_000, 0.1)}
 
@@ -185,7 +187,7 @@ def cleaned(folder, case, vis, name, with_file, setting):
     with quiet(folder / f"{name}.log"):
         tclean(vis=vis, imagename=str(folder / name), weighting="briggs", robust=0.5, deconvolver="multiscale",
                scales=sorted({round(scale * 4.7) for scale in scales}), smallscalebias=bias, niter=niter, gain=gain,
-               nsigma=2.0, pblimit=-1e-9, cyclefactor=1.5, wprojplanes=64 if case.gridder == "wproject" else 1,
+               threshold=THRESHOLD, pblimit=-1.0, cyclefactor=1.5, wprojplanes=64 if case.gridder == "wproject" else 1,
                outlierfile=outlier_file(folder, case, name) if with_file else "", **case.grid)
     seconds, beam = time.perf_counter() - begin, read_image(str(folder / name) + ".image")[1]
     return [read_image(str(folder / name) + kind)[0] for kind in (".model", *["_far.model"] * with_file)], beam, seconds

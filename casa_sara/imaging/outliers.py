@@ -147,7 +147,8 @@ def outlier_planes(request, data, grid):
             start = read_model(outlier.startmodel, plane)
         if not plane.mask.any():
             data.notes.append(f"outlierfile: the primary beam is below pblimit = {request.output.pblimit:g} in all of "
-                              f"image '{outlier.imagename}', whose pixels are masked; its model is not")
+                              f"image '{outlier.imagename}', whose pixels are masked; its model is not, and nothing is "
+                              "where pblimit is negative")
         planes.append(OutlierPlane(outlier, plane, start, read_support(outlier.grid, plane)))
     return tuple(planes)
 

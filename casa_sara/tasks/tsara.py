@@ -395,8 +395,8 @@ class _tsara:
         begin with # are comments. Other parameters of tclean's file may stand there where they say what
         holds for the main image, and are refused with their line where they do not; deconvolver always is.
         The images must not overlap. Models are those of the sky times the primary beam at their place,
-        and masked in .residual and .image where that is below pblimit. savemodel and restart hold for all
-        of them.
+        and masked in .residual and .image where that is below pblimit, unless pblimit is negative. savemodel
+        and restart hold for all of them.
         Not available with it: specmode='cube', gridder='mosaic', stokes other than 'I',
         method='dabbech2018', nterms above 1, spectralindex, sdimage, ndraws, jackknife, report=True and
         parallel=True.
