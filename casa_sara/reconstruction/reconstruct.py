@@ -54,10 +54,10 @@ class Control:
     drawn : callable
         Called with 'jackknife' and its `Draws`, then with 'draws' and those of the bootstrap: before the first one of
         each, and after every one.
-    begun : callable
-        Called with the `Solution` before its first iteration, or once it has been resumed.
     then : callable, optional
         Called at the end with the iteration, its bounds and its record, all as the solution has left them.
+    begun : callable
+        Called with the `Solution` before its first iteration, or once it has been resumed.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
@@ -65,8 +65,8 @@ class Control:
     checkpoint: Checkpoint | None = None
     tell: Callable[[str], None] = lambda line: None
     drawn: Callable[[str, Draws], None] = lambda name, draws: None
-    begun: Callable[[Solution], None] = lambda solution: None
     then: Callable[[AdaptivePPD, Any, SolverRecord], None] | None = None
+    begun: Callable[[Solution], None] = lambda solution: None
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,

@@ -9,8 +9,8 @@ cone where Step 17 projects on it in the metric that belongs to these steps:
 
     x ← arg min Σ_s |x_s − (z_s − τc_s∇f_s)|²/c_s   over I ≥ 0, |(Q, U, V)| ≤ I.
 
-With a_s = c_s that is x_s = p_s/(1 + λa_s) for Q, U and V, and I = |(Q, U, V)|, λ the root of |p(λ)|(1 − λa_I) = p_I: see
-:func:`casa_sara.solver._kernels.cone_step`.  An iteration that has come to its end stays where it is, a_s = 0.
+With a_s = c_s that is x_s = p_s/(1 + λa_s) for Q, U and V, and I = |(Q, U, V)|, λ the root of |p(λ)|(1 − λa_I) = p_I
+(:func:`casa_sara.solver._kernels.cone_step`).  An iteration that has come to its end stays where it is, a_s = 0.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class PolarisationCone:
         self._ppds = tuple(ppds)
         self._before = tuple(np.empty_like(ppd.model) for ppd in ppds)
         self._free = np.empty_like(ppds[0].model)
-        self._sums = np.zeros((len(ppds), len(self._free), 4))
+        self._sums = np.zeros((len(self._free), 4))
 
     def step(self, going: Mapping[int, GivenBounds | AdaptiveBounds]) -> None:
         """Do one step of the iterations that go on.
@@ -58,8 +58,9 @@ class PolarisationCone:
             self._ppds[0].unprojected(self._free)
         self._project(self._metric(going))
         for number in going:
-            sums = self._sums[number]
-            self._ppds[number].account_for([*sums[:, :3].sum(axis=0).tolist(), float(sums[:, 3].max())])
+            ppd, sums = self._ppds[number], self._sums
+            ppd.measurement.workers.run(kernels.changes, ppd.model, self._before[number], sums)
+            ppd.account_for([*sums[:, :3].sum(axis=0).tolist(), float(sums[:, 3].max())])
 
     def _metric(self, going):
         """Return a_s in Jy², in units of the largest; 0 for an iteration that has ended."""
@@ -74,5 +75,5 @@ class PolarisationCone:
         first, units = self._ppds[0], np.array([ppd.unit_jy for ppd in self._ppds])
         models, bars, anchors = (tuple(getattr(ppd, name) for ppd in self._ppds)
                                  for name in ("model", "model_bar", "anchor"))
-        first.measurement.workers.run(kernels.cone_step, models, bars, anchors, self._before, self._free,
-                                      first.lowest, units, metric, self._sums)
+        first.measurement.workers.run(kernels.cone_step, models, bars, anchors, self._free,
+                                      first.lowest, units, metric)
