@@ -1,5 +1,6 @@
 """Mosaics: operator against explicit sums, beams and weights against Airy patterns and tclean, sources recovered."""
 
+import json
 import os
 import signal
 
@@ -17,6 +18,7 @@ from casa_sara.options import ImageGrid, Selection, Spectrum
 SHAPE, CELL = (90, 74), (1e-5, 1.3e-5)
 SQUARES = np.linspace(0, 1, 4097)
 HEXAGON = [(0, 0), (30, 0), (-15, 26), (-15, -26), (15, 26), (15, -26), (-30, 0)]  # arcsec, half a beam apart
+NEAR_CENTRE = f"circle[[{CENTRE[0]}deg, {CENTRE[1]}deg], 8arcsec]"
 AT_CENTRE = f"J2000 {CENTRE[0]}deg {CENTRE[1]}deg"
 
 
@@ -385,7 +387,6 @@ def test_model_column_is_the_sky_through_the_beams(folder, tmp_path, monkeypatch
 
 @pytest.mark.parametrize("parameters, message", [
     (dict(specmode="cube"), "specmode = 'cube' with gridder = 'mosaic'"),
-    (dict(report=True), "report = True with gridder = 'mosaic'"),
     (dict(parallel=True), "parallel = True with gridder = 'mosaic'"),
     (dict(ndraws=20), "ndraws = 20 with gridder = 'mosaic': .*; should be 0"),
     (dict(jackknife=True), "jackknife = True with gridder = 'mosaic': .*; should be False"),
@@ -412,13 +413,76 @@ def test_dishes_without_a_beam_are_refused(folder, tmp_path):
         tsara(vis=name, imagename=str(tmp_path / "no"), niter=0, **GRID)
 
 
-def test_comparison_of_mosaics_is_refused(mixed, tmp_path):
+@pytest.fixture(scope="module")
+def reported(mixed, folder):
+    """A short run with its report, as products and measures."""
+    name = str(folder / "reported")
+    tsara(vis=mixed, imagename=name, niter=15, wavelets=["dirac"], report=True, **GRID)
+    with open(name + ".report/measures.json") as file:
+        return name, json.load(file)["products"]["reported"]
+
+
+@pytest.mark.slow
+def test_report_measures_where_the_mosaic_sees(reported):
+    """σ, peak and flux are those of .residual, .image and .model where .pb is above pblimit."""
     from casa_sara import saracompare
 
-    name = str(tmp_path / "x")
-    tsara(vis=mixed, imagename=name, niter=0, **GRID)
-    with pytest.raises(ValueError, match="models: '.*x' was imaged with gridder = 'mosaic'"):
-        saracompare(models=[name, name], outdir=str(tmp_path / "out"))
+    name, measures = reported
+    pb, model = pixels(name + ".pb"), pixels(name + ".model")
+    residual, image, area = pixels(name + ".residual"), pixels(name + ".image"), pb >= 0.2
+    assert os.path.isfile(name + ".report/report.html") and 0.2 < area.mean() < 0.8
+    assert measures["natural"]["sigma"] == pytest.approx(residual[area].std(), rel=1e-4)
+    assert measures["natural"]["peak"] == pytest.approx(image[area].max(), rel=1e-3)
+    assert measures["flux_jy"] == pytest.approx(model[area].sum(dtype=float), rel=1e-5)
+    assert np.mean(measures["natural"]["chi_square"]) == pytest.approx(1, abs=0.1)
+    with pytest.raises(ValueError, match="regions: .* primary beam of the mosaic is too low"):
+        saracompare(models=[name, name], regions=["circle[[150.03deg, -30.025deg], 3arcsec]"])
+
+
+@pytest.mark.parametrize("gridder, parameters, message", [
+    ("mosaic", dict(inject=["150deg, -30deg"]), "inject = .* with images of gridder = 'mosaic'.*; should be \\[\\]"),
+    ("mosaic", dict(features=[NEAR_CENTRE]), "features = .* with images of gridder = 'mosaic'.*; should be \\[\\]"),
+    ("standard", {}, "'.*other' was imaged with gridder = 'standard', .* should be images of gridder = 'mosaic'")])
+def test_comparisons_that_mosaics_do_not_have(mixed, folder, tmp_path, gridder, parameters, message):
+    from casa_sara import saracompare
+
+    names = [str(tmp_path / name) for name in ("one", "other")]
+    for name, given in zip(names, ("mosaic", gridder)):
+        tsara(vis=mixed, imagename=name, niter=0, **GRID | dict(gridder=given, onepointing=given != "mosaic"))
+    with pytest.raises(ValueError, match=message):
+        saracompare(models=names, vis=mixed, datacolumn="data", **parameters)
+
+
+@pytest.mark.slow
+def test_comparison_beside_tclean(mixed, reported, tmp_path, monkeypatch):
+    """tclean's model is the sky × .pb and becomes the sky; its residual by our beams is nearly its own."""
+    import casatasks
+
+    from casa_sara import saracompare
+
+    monkeypatch.chdir(tmp_path)
+    casatasks.tclean(vis=mixed, imagename="theirs", niter=300, pblimit=0.2, weighting="natural", **GRID)
+    truth = np.zeros((240, 216, 1, 1), np.float32)
+    for flux, l, m in SKY:
+        truth[round(120 - l / ARCSEC / 0.9), round(108 + m / ARCSEC / 0.9)] += flux
+    os.system("cp -r theirs.model truth.model")
+    ia = casatools.image()
+    ia.open("truth.model")
+    ia.putchunk(truth)
+    ia.close()
+    options = dict(models=[reported[0], "theirs"], names=["ours", "theirs"], truth="truth.model")
+    found = saracompare(vis=mixed, datacolumn="data", regions=[NEAR_CENTRE], **options)["products"]
+    sigma = pixels("theirs.residual")[pixels("theirs.pb") >= 0.2].std()
+    assert found["theirs"]["natural"]["sigma"] == pytest.approx(sigma, rel=0.1)
+    region = found["theirs"]["regions"][NEAR_CENTRE]
+    assert region["flux_jy"] == pytest.approx(SKY[0][0], abs=3 * region["error_jy"] + 0.02)
+    sky = pixels("theirs.model") / np.maximum(pixels("theirs.pb"), 0.1)
+    assert found["theirs"]["flux_jy"] == pytest.approx(sky[pixels(reported[0] + ".pb") >= 0.2].sum(), rel=1e-3)
+    assert found["theirs"]["truth"]["snr_at_scale"] and found["ours"]["truth"]["snr_at_scale"]
+    # without visibilities the residuals are those beside the models
+    beside = saracompare(**options)["products"]
+    assert beside["theirs"]["natural"]["sigma"] == pytest.approx(sigma, rel=0.1)
+    assert beside["ours"]["natural"]["sigma"] == pytest.approx(found["ours"]["natural"]["sigma"], rel=1e-3)
 
 
 def test_dryrun_of_a_mosaic(mixed, tmp_path):

@@ -35,6 +35,9 @@ class Product:
         with the beam of each weighting, Jy/pixel; and that of its flux in each region, Jy.
     features : dict
         Of each region tested: its measures, the models with and without emission there, Jy/pixel, and its mask.
+    primary_beams : dict
+        Of mosaics, weighting → primary beam, NaN where nothing is compared; else empty. Models are the sky then, and
+        residual and restored images the sky times the primary beam, NaN where that is.
     """
 
     name: str
@@ -47,6 +50,7 @@ class Product:
     smoothed_error: dict[str, np.ndarray] = field(default_factory=dict)
     region_errors: dict[str, float] = field(default_factory=dict)
     features: dict[str, tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=dict)
+    primary_beams: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -172,7 +172,7 @@ def _residual_spectra(panel, comparison, weighting) -> None:
             continue
         residual = product.residual[weighting]
         frequency, power = radial_spectrum(residual, comparison.cell_arcsec, window=True)
-        power /= np.nanvar(residual) * residual.size
+        power /= np.nanvar(residual) * np.isfinite(residual).sum()
         panel.plot(frequency[1:] / 1e3, power[1:], lw=1.4, label=plain(product.name), **line(number))
         lowest, highest = min(lowest, power[1:].min()), max(highest, power.max())
     panel.axhline(1, color="0.3", ls="--", lw=1)

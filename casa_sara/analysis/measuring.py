@@ -108,8 +108,9 @@ def _model(product, support):
 def _residual(product, weighting):
     """Measures of the residual and of the restored image."""
     residual, restored = product.residual[weighting], product.restored[weighting]
-    return residual_statistics(residual) | {
-        "peak": float(restored.max()),
+    seen = np.isfinite(residual) if product.primary_beams else None
+    return residual_statistics(residual, seen) | {
+        "peak": float(np.nanmax(restored)),
         "dr": metrics.dynamic_range(restored, residual),
     }
 
@@ -120,8 +121,11 @@ def _region(product: Product, mask, cell_arcsec, beams):
     for weighting in WEIGHTINGS:
         if weighting in product.restored:
             beam = metrics.beam_pixels(beams[weighting][:2], cell_arcsec)
-            rms = product.residual[weighting].std()
-            flux, error = metrics.integrated_flux(product.restored[weighting], mask, "Jy/beam", beam, rms)
+            image, rms, where = product.restored[weighting], np.nanstd(product.residual[weighting]), mask
+            if product.primary_beams:  # the flux of the sky, and its noise
+                pb, where = product.primary_beams[weighting], mask & np.isfinite(image)
+                image, rms = image / pb, rms * np.sqrt(np.mean(pb[where] ** -2.0))
+            flux, error = metrics.integrated_flux(image, where, "Jy/beam", beam, rms)
             return {"flux_jy": flux, "error_jy": error, "model_flux_jy": model, "weighting": weighting}
     return {"flux_jy": model, "model_flux_jy": model}
 

@@ -8,13 +8,15 @@ import numpy.typing as npt
 __all__ = ["radial_power_spectrum", "residual_statistics", "whiteness"]
 
 
-def residual_statistics(residual: npt.ArrayLike) -> dict[str, float]:
+def residual_statistics(residual: npt.ArrayLike, seen: np.ndarray | None = None) -> dict[str, float]:
     """Return the statistics of a residual image.
 
     Parameters
     ----------
     residual : array_like (nx, ny)
         Finite, not constant.
+    seen : bool (nx, ny), optional
+        Where it is looked at; everywhere by default.
 
     Returns
     -------
@@ -27,7 +29,9 @@ def residual_statistics(residual: npt.ArrayLike) -> dict[str, float]:
     ValueError
         Pixels are not finite, or all are equal.
     """
-    residual = np.asarray(residual, float)
+    image = residual = np.asarray(residual, float)
+    if seen is not None:
+        image, residual = np.where(seen, image, 0), image[seen]
     if not np.isfinite(residual).all():
         raise ValueError(f"residual: {np.sum(~np.isfinite(residual))} pixels are not finite: all should be")
     sigma = residual.std()
@@ -39,7 +43,7 @@ def residual_statistics(residual: npt.ArrayLike) -> dict[str, float]:
         "max_abs": float(np.abs(residual).max()),
         "skewness": float(np.mean(scaled**3)),
         "kurtosis": float(np.mean(scaled**4) - 3),
-        "whiteness": whiteness(residual),
+        "whiteness": whiteness(image),
     }
 
 

@@ -19,6 +19,7 @@ from casa_sara.comparison.compare_images import (
     versions,
 )
 from casa_sara.comparison.observed_cube import ObservedCube
+from casa_sara.comparison.skies import refuse_mosaics
 from casa_sara.options import Comparing, Selection
 
 __all__ = ["compare_cubes"]
@@ -57,6 +58,7 @@ def compare_cubes(request: Comparing, selection: Selection | None = None, single
             right = "''" if isinstance(value, str) else "[]"
             raise ValueError(f"{name} = {value!r} with cubes: for images of one channel only; should be {right}")
     sets = read_products(request, 1 if single else 2, with_residual=selection is None, cube=True)
+    refuse_mosaics(request.models, sets)
     first, notes = sets[0].model, []
     check_frame(first, notes)
     truth = read_sky_cube(request.truth, "truth", UNITS) if request.truth else None

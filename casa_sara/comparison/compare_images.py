@@ -20,6 +20,8 @@ from casa_sara.casa.runtime import log
 from casa_sara.comparison.features import measures_of, test_features
 from casa_sara.comparison.injection import Injection, can_be_repeated, recover
 from casa_sara.comparison.observed import Observed
+from casa_sara.comparison.observed_mosaic import ObservedMosaic
+from casa_sara.comparison.skies import as_skies, common_area, is_mosaic
 from casa_sara.options import Comparing, Selection
 from casa_sara.reconstruction.draws import read_draws
 from casa_sara.version import __version__
@@ -59,12 +61,13 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
         The products cannot be compared; the message names the task parameter.
     """
     fewest = 1 if single or request.features or request.inject else 2
-    sets = read_products(request, fewest, with_residual=selection is None)
+    sets = as_skies(request, read_products(request, fewest, with_residual=selection is None))
     first, notes = sets[0].model, []
     check_frame(first, notes)
     frames = read_frames(request.frames, first.plane.upright())
     # one grid
-    observed = Observed(selection, first.plane.upright(), request, sets, notes) if selection else None
+    kind = ObservedMosaic if any(map(is_mosaic, sets)) else Observed
+    observed = kind(selection, first.plane.upright(), request, sets, notes) if selection else None
     plane = observed.plane if observed else _common_plane(sets, notes)
     models = {one.name: _on_grid(one.model, plane, first, "models", notes) for one in sets}
     truth = _truth(request, plane, first, notes)
@@ -80,8 +83,14 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     else:
         check_same_data(sets)
         beams, residuals, chi_square = *_beside(sets, plane, notes), {}
+    primary_beams, area = common_area(sets, observed.primary_beams if observed else {}, plane, notes)
+    if area is not None:
+        models = {name: model * area for name, model in models.items()}
+        truth = truth if truth is None else truth * area
+        _check_regions(regions, area)
     # measure
-    products = tuple(product_of(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec) for one in sets)
+    products = tuple(product_of(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec, primary_beams)
+                     for one in sets)
     products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec),
                              features=_tested(one, features.get(one.name), of_features, plane, repeat))
                      for product, one in zip(products, sets))
@@ -149,7 +158,6 @@ def read_products(request, fewest, **options):
     if len(set(names)) < len(names) or any("|" in name or not name.strip() for name in names):
         raise ValueError(f"names = {list(names)}: should differ, not be empty, and hold no '|'")
     sets = [read_image_set(given, name, **options) for given, name in zip(models, names or [""] * len(models))]
-    _refuse_mosaics(models, sets)
     taken = set()
     for number, one in enumerate(sets):
         name = one.name.replace("|", "_")
@@ -160,12 +168,12 @@ def read_products(request, fewest, **options):
     return sets
 
 
-def _refuse_mosaics(models, sets):
-    """Raise where a product is of several pointings."""
-    for given, one in zip(models, sets):
-        if one.parameters.get("gridder", "").startswith("mosaic"):
-            raise ValueError(f"models: '{given}' was imaged with gridder = 'mosaic': should be an image of a single "
-                             "pointing, which alone can be compared, and tested with inject and features")
+def _check_regions(regions, area):
+    """Raise where a region has nothing of what is compared of mosaics."""
+    for name, mask in regions.items():
+        if not (mask & area).any():
+            raise ValueError(f"regions: '{name}' lies where the primary beam of the mosaic is too low to compare: "
+                             "should be within the mosaic")
 
 
 def _on_grid(image, plane, first, parameter, notes):
@@ -199,14 +207,19 @@ def other_data(sets, selection):
             yield f"{len(one.record['wild'])} outliers that '{one.name}' left out are included in the residuals of all"
 
 
-def product_of(one, model, residuals, beams, cell_arcsec):
-    """Return a product with its restored images, model ∗ beam + residual."""
-    restored = {}
+def product_of(one, model, residuals, beams, cell_arcsec, primary_beams=None):
+    """Return a product with its restored images, model ∗ beam + residual, blank where the primary beam is."""
+    restored, of_product = {}, dict(residuals)
     for weighting, residual in residuals.items():
         *axes, angle = beams[weighting]
-        smoothed = metrics.smooth(model, axes, angle, cell_arcsec) * metrics.beam_pixels(axes, cell_arcsec)
-        restored[weighting] = smoothed + residual
-    return Product(one.name, model, residuals, restored, dict(one.parameters), dict(one.record))
+        seen = model
+        if primary_beams:
+            pb = primary_beams[weighting]
+            seen, of_product[weighting] = model * np.nan_to_num(pb), np.where(np.isfinite(pb), residual, np.nan)
+        smoothed = metrics.smooth(seen, axes, angle, cell_arcsec) * metrics.beam_pixels(axes, cell_arcsec)
+        restored[weighting] = smoothed + of_product[weighting]
+    return Product(one.name, model, of_product, restored, dict(one.parameters), dict(one.record),
+                   primary_beams=primary_beams or {})
 
 
 def _features(request, sets, observed):

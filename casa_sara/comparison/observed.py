@@ -15,6 +15,7 @@ from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.ms.weights import dirty_image, imaging_weights
 from casa_sara.casa.runtime import log
 from casa_sara.comparison.injection import spectral_index_of
+from casa_sara.comparison.skies import is_mosaic
 from casa_sara.data.blocks import snapshot_blocks
 from casa_sara.imaging.mosaic import check_pointings
 from casa_sara.imaging.plane_images import IMAGE_EPS
@@ -44,9 +45,8 @@ class Observed:
         longitude, latitude = (float(angle) for angle in plane.centre)
         grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
         with kernels_loading(log.info):
-            data = read_visibilities(selection, grid.phasecenter,
-                                     frequencies=any(spectral_index_of(one) or one.spectra for one in sets))
-        notes.extend(data.notes + check_pointings(data, replace(grid, onepointing=True)))
+            data = read_visibilities(selection, grid.phasecenter, frequencies=self._needs_frequencies(sets))
+        data, grid = self._prepared(data, selection, grid, sets, notes)
         self._gridder = common_gridder(sets, data.max_w, plane, notes)
         image_plane = define_image_plane(data, selection, grid)
         notes.extend(image_plane.notes)
@@ -60,6 +60,20 @@ class Observed:
                       for weighting, weights in self._weights.items()}
         self._block_of_sample, blocks = snapshot_blocks(data)
         self._samples = np.array([block.samples for block in blocks])
+
+    def _needs_frequencies(self, sets):
+        """Whether the samples keep their frequencies."""
+        return any(spectral_index_of(one) or one.spectra for one in sets)
+
+    def _prepared(self, data, selection, grid, sets, notes):
+        """Return the samples that are used, and the grid for their weights."""
+        notes.extend(data.notes + check_pointings(data, replace(grid, onepointing=True)))
+        return data, grid
+
+    @property
+    def primary_beams(self) -> dict[str, np.ndarray]:
+        """Weighting → primary beam (nx, ny) on the common grid, of a mosaic; else empty."""
+        return {}
 
     def measured(self, sets, models):
         """Return the beams, and by product the residual images and χ² of the blocks, of models on the common grid."""
@@ -124,6 +138,8 @@ def common_gridder(sets, max_w, plane, notes):
 
     That is without the w-term where all were imaged without it, or where it is nothing; else with it.
     """
+    if any(is_mosaic(one) for one in sets):
+        return "standard"  # of the PSF; the operator of mosaics has the w-term in it
     phase = WTerm.of(max_w, plane.shape, plane.cell_rad, IMAGE_EPS).phase
     without = [one.name for one in sets if one.parameters.get("gridder", "") == "standard"
                or one.parameters.get("taskname") == "tsara" and "gridder" not in one.parameters]

@@ -14,7 +14,8 @@ from casa_sara.operators.beams import Beam, Mosaic
 from casa_sara.operators.mosaic import remaining_w_phase
 from casa_sara.operators.sky import sky_operator
 
-__all__ = ["MosaicModel", "beams_record", "check_pointings", "flat_noise", "w_note", "weight_image", "with_beams"]
+__all__ = ["MosaicModel", "beams_record", "check_pointings", "flat_noise", "predicted", "w_note", "weight_image",
+           "with_beams"]
 
 SAME_POINTING = 1e-6  # rad, the least that fields may be apart
 SAME_BEAM = 0.01  # of the beam of a dish of 25 m, the largest that is common
@@ -169,13 +170,35 @@ class MosaicModel:
             return vis
         row = np.repeat(np.arange(rows.ms.size), count // rows.ms.size)
         data = Visibilities(vis=vis, weight=np.ones(count), uvw=uvw, row=row, rows=rows, freq_hz=freq_hz, **self._where)
-        mosaic, beam = _mosaic(primary_beams(data, self._selection, self._grid, self._profiles), self._grid)
-        seen = np.flatnonzero(beam >= 0)
-        if seen.size:
-            operator = sky_operator(uvw[:, seen], replace(self._grid, mosaic=mosaic), freq_hz[seen], beam=beam[seen],
-                                    **self._accuracy)
-            vis[seen] = operator.forward(self._model)
-        return vis
+        return predicted(self._model, data, self._selection, self._grid, self._profiles, **self._accuracy)
+
+
+def predicted(model, data, selection, grid, profiles, **accuracy):
+    """Return the visibilities of a sky through the primary beams of the samples, complex64 (M,).
+
+    Parameters
+    ----------
+    model : real (nx, ny)
+        Jy/pixel.
+    data : casa_sara.data.visibilities.Visibilities
+        The samples; those that see nothing of the image are 0.
+    selection : casa_sara.options.Selection
+        Of the data.
+    grid : casa_sara.options.ImageGrid
+        Of the model; its `spectrum` is used.
+    profiles : casa_sara.casa.images.primary_beams.Profiles
+        Of the beams of these data.
+    **accuracy : object
+        `eps` and `nthreads` of the operator.
+    """
+    vis = np.zeros(data.size, np.complex64)
+    mosaic, beam = _mosaic(primary_beams(data, selection, grid, profiles), grid)
+    seen = np.flatnonzero(beam >= 0)
+    if seen.size:
+        operator = sky_operator(data.uvw[:, seen], replace(grid, mosaic=mosaic), data.freq_hz[seen], beam=beam[seen],
+                                **accuracy)
+        vis[seen] = operator.forward(model)
+    return vis
 
 
 def w_note(data, mosaic, largest):

@@ -212,7 +212,6 @@ def _refuse_for_mosaics(parameters):
         return
     for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
                                 ("parallel", False, "a mosaic takes one process"),
-                                ("report", False, "reports are made of single pointings only"),
                                 ("ndraws", 0, "errors by bootstrap are of single pointings only"),
                                 ("jackknife", False, "errors by jackknife are of single pointings only")):
         if parameters[name] != right:

@@ -20,6 +20,11 @@ class _saracompare:
     to it with their flux conserved; their residuals are made on their own grid, where it has the same
     centre. Images that cannot be compared are refused.
 
+    Images of gridder='mosaic' are compared as the sky itself, where the primary beam is above pblimit:
+    the model of tsara is the sky, that of tclean is divided by its .pb. Residual and restored images
+    are the sky times the primary beam, with the same noise everywhere; fluxes in regions are of the
+    sky. inject and features are for images of single pointings.
+
     Cubes are compared channel by channel, and must have the same channels: models, residuals and
     fluxes in regions of each, the spectra, and the maps of the line: moment 0, the sum over the
     channels, and moment 1, the mean velocity. support, frames, inject and features are for images of

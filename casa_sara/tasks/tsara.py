@@ -308,7 +308,7 @@ class _tsara:
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
         The model is zero where .pb is below 0.1. The visibilities of a mosaic are not averaged. Not available
-        with 'mosaic': specmode='cube', parallel=True, ndraws, jackknife, report and saracompare.
+        with 'mosaic': specmode='cube', parallel=True, ndraws and jackknife.
 
     onepointing : bool, default False
         Opened by gridder = 'standard' or 'wproject'.

@@ -43,6 +43,8 @@ class ImageSet:
         File of the draws of a bootstrap, '' where there is none.
     spectra : str
         Image of the model at several frequencies, '' where its spectra were not solved for.
+    pb : str
+        Image of the primary beam, '' where there is none.
     """
 
     name: str
@@ -53,6 +55,7 @@ class ImageSet:
     record: dict[str, Any] = field(default_factory=dict)
     draws: str = ""
     spectra: str = ""
+    pb: str = ""
 
     def called(self, name):
         """Return the same with another name."""
@@ -114,7 +117,8 @@ def read_image_set(given, name="", with_residual=True, cube=False):
     record = root + RECORD
     return ImageSet(name or os.path.basename(root), model, residual, next(filter(None, beams), None),
                     parameters | model.parameters, read_record(record) if os.path.isfile(record) else {},
-                    root + DRAWS if os.path.isfile(root + DRAWS) else "", _beside(root, ".subbands"))
+                    root + DRAWS if os.path.isfile(root + DRAWS) else "", _beside(root, ".subbands"),
+                    _beside(root, ".pb"))
 
 
 def read_frames(names, plane):
