@@ -341,12 +341,11 @@ class AdaptivePPD:
             self.comm.barrier()
             sums, greatest = np.maximum(sums, (0, 0, -np.inf)), self.model.max()
         self.account_for(self.comm.bcast_numbers([*sums.tolist(), float(greatest)]))
-        if self.planes.n_planes > 1:
+        if self.planes.n_planes > 1 or self.sky_over_image is not None:
             seen = self.planes.at_reference(self.model)
+            if self.sky_over_image is not None:
+                seen = np.multiply(seen, self.sky_over_image, out=self.planes.split(self.scratch_image)[0])
             self.model_flux, self.model_max = float(seen.sum(dtype=float)), float(seen.max())
-        if self.sky_over_image is not None:
-            sky = np.multiply(self.model, self.sky_over_image, out=self.scratch_image)
-            self.model_flux, self.model_max = float(sky.sum(dtype=float)), float(sky.max())
 
     def account_for(self, sums: Sequence[float]) -> None:
         """Take σ, the flux and the largest pixel from sums over the model after a step.
