@@ -12,6 +12,7 @@ from typing import Any
 from casa_sara.analysis import folder
 from casa_sara.casa.images.products import (
     CHECKPOINT,
+    PRODUCTS,
     REPORT,
     check_imagename,
     existing_products,
@@ -29,6 +30,7 @@ from casa_sara.casa.runtime.quantities import hertz, seconds
 from casa_sara.imaging.continuum import make_image
 from casa_sara.imaging.cube import make_cube
 from casa_sara.imaging.dry_run import dry_run
+from casa_sara.imaging.polarisation import make_polarised
 from casa_sara.options import (
     Comparing,
     ImageGrid,
@@ -44,7 +46,7 @@ from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.private.launch import in_parallel
 from casa_sara.private.outlier_file import read_outlier_file
 from casa_sara.private.pixels import cell_rad, pair
-from casa_sara.private.summary import cube_summary, summary
+from casa_sara.private.summary import cube_summary, polarised_summary, summary
 from casa_sara.runtime.machine import available_cores
 from casa_sara.version import __version__
 
@@ -60,6 +62,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     _check_single_dish(parameters)
     _refuse_for_spectra(parameters)
     _refuse_for_outliers(parameters)
+    _refuse_for_several_stokes(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -83,7 +86,7 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     if parameters["dryrun"]:
         output = Output(parameters["imagename"], blocks=_blocks(parameters))
         return {"forecast": dry_run(selection, grid, options, output, limits)}
-    make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
+    make, tell = _face_of(grid)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
         grid = _continued(grid, output)
@@ -97,9 +100,17 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     return comm.bcast(tell(result, options, parameters["fullsummary"]))
 
 
+def _face_of(grid):
+    """Return what makes such an image, and what tells of it."""
+    if len(grid.stokes) > 1:
+        return make_polarised, polarised_summary
+    return (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
+
+
 def _prepare(parameters, selection, grid, stack):
     """Take the imagename for as long as the stack lasts, and return the options of the output."""
     more = 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"]) + parameters["jackknife"]
+    more = len(grid.stokes) * (len(PRODUCTS) + more) - len(PRODUCTS)
     for imagename, shape in zip(_imagenames(parameters, grid), grid.shapes):
         check_imagename(imagename, shape, more)
         stack.enter_context(one_run_of(imagename))
@@ -268,9 +279,8 @@ def _refuse_for_outliers(parameters):
     name = parameters["outlierfile"]
     if not name:
         return
-    allowed = dict(gridder=("standard", "wproject"))
     for parameter, right, reason in (("specmode", "mfs", "outliers are of continuum images"),
-                                     ("gridder", "standard", "outliers are of single pointings"),
+                                     ("gridder", ("standard", "wproject"), "outliers are of single pointings"),
                                      ("stokes", "I", "outliers are of Stokes I"),
                                      ("method", "tsara", "the paper has one image"),
                                      ("nterms", 1, "the spectra of outliers are flat"),
@@ -280,9 +290,30 @@ def _refuse_for_outliers(parameters):
                                      ("jackknife", False, "errors by jackknife are of one image"),
                                      ("report", False, "reports are made of one image"),
                                      ("parallel", False, "outliers take one process")):
-        if parameters[parameter] not in allowed.get(parameter, (right,)):
+        allowed = right if isinstance(right, tuple) else (right,)
+        if parameters[parameter] not in allowed:
             raise ValueError(f"{parameter} = {parameters[parameter]!r} with outlierfile = '{name}': {reason}; should "
-                             f"be {right!r}")
+                             f"be {' or '.join(map(repr, allowed))}")
+
+
+def _refuse_for_several_stokes(parameters):
+    """Raise on parameters that images of several Stokes parameters do not have."""
+    stokes = parameters["stokes"]
+    if len(stokes) == 1:
+        return
+    for name, right, reason in (("specmode", "mfs", "they are continuum images"),
+                                ("gridder", ("standard", "wproject"), "mosaics are of one Stokes parameter"),
+                                ("method", "tsara", "the paper's method has one image"),
+                                ("parallel", False, "they take one process"),
+                                ("ndraws", 0, "errors by bootstrap are of one image"),
+                                ("jackknife", False, "errors by jackknife are of one image")):
+        allowed = right if isinstance(right, tuple) else (right,)
+        if parameters[name] not in allowed:
+            raise ValueError(f"{name} = {parameters[name]!r} with stokes = '{stokes}': {reason}; should be "
+                             f"{' or '.join(map(repr, allowed))}")
+    if "I" in stokes and parameters["polbound"] and not parameters["positivity"]:
+        raise ValueError(f"positivity = False with stokes = '{stokes}' and polbound = True: where |(Q, U, V)| is at "
+                         "most I, I is not negative; should be True, or polbound = False")
 
 
 def _check_stokes(parameters):
@@ -290,7 +321,8 @@ def _check_stokes(parameters):
     stokes = parameters["stokes"]
     if stokes == "I":
         return
-    for name, right, reason in (("positivity", False, "the image may be negative"),
+    signed = (("positivity", False, "the image may be negative"),) if "I" not in stokes else ()
+    for name, right, reason in (*signed,
                                 ("savemodel", "none", "MODEL_DATA is written for Stokes I only"),
                                 ("report", False, "reports are made for Stokes I only")):
         if parameters[name] != right:

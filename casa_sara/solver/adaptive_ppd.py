@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -344,18 +344,46 @@ class AdaptivePPD:
                                                 self.planes.places(self.points))
             self.comm.barrier()
             of_parts, greatest = np.maximum(of_parts, (0, 0, -np.inf)), self.model.max()
-        sums = [*of_parts.sum(axis=0).tolist(), float(greatest)]
-        change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
-        self.rel_change = _relative_change(change, norm)
+        self.account_for(self.comm.bcast_numbers([*of_parts.sum(axis=0).tolist(), float(greatest)]))
         if len(of_parts) > 1:  # what is bright elsewhere must not hide that the main image still changes
-            main = self.planes.main(self.model)
-            self.rel_change = max(self.rel_change, _relative_change(*of_parts[0, :2]))
-            self.model_flux, self.model_max = float(of_parts[0, 2]), float(main.max())
+            whole = self.rel_change
+            self.account_for([*of_parts[0].tolist(), float(self.planes.main(self.model).max())])
+            self.rel_change = max(self.rel_change, whole)
         if self.planes.n_planes > 1 or self.sky_over_image is not None:
             seen = self.planes.at_reference(self.model)
             if self.sky_over_image is not None:
                 seen = np.multiply(seen, self.sky_over_image, out=self.planes.split(self.scratch_image)[0])
             self.model_flux, self.model_max = float(seen.sum(dtype=float)), float(seen.max())
+
+    def account_for(self, sums: Sequence[float]) -> None:
+        """Take σ, the flux and the largest pixel from sums over the model after a step.
+
+        Parameters
+        ----------
+        sums : float (4,)
+            Σ(x − x_prev)², Σx², Σx and max x.
+        """
+        change, norm, self.model_flux, self.model_max = sums
+        self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
+
+    def unprojected(self, out: np.ndarray) -> np.ndarray:
+        """Return z − τ(ηΦ†v + ζΨu), what Step 17 has projected: of the last step, in one process.
+
+        Parameters
+        ----------
+        out : real (nx, ny)
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
+        real = self.model.dtype.type
+        np.multiply(self._data_gradient, real(self.l2_step), out=out)
+        out += self._prior_gradient
+        out *= real(-self.tau)
+        out += self.anchor
+        return out
 
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.
@@ -449,8 +477,3 @@ class AdaptivePPD:
         self.l2_bounds = np.array(state["l2_bounds"])
         self.points = PointSources(state["points"])
         self.correction = None if state.get("correction") is None else np.array(state["correction"])
-
-
-def _relative_change(change_sq, norm_sq):
-    """σ, from Σ(x⁺ − x)² and Σ(x⁺)²."""
-    return float(np.sqrt(change_sq / norm_sq)) if norm_sq > 0 else float(change_sq > 0)
