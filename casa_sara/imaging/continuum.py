@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -36,6 +36,17 @@ from casa_sara.imaging.dry_run import forecast_run, scratch_of
 from casa_sara.imaging.error_images import error_images
 from casa_sara.imaging.island_list import list_islands
 from casa_sara.imaging.mosaic import check_pointings, weight_image, with_beams
+from casa_sara.imaging.outliers import (
+    OutlierPlane,
+    OutlierResult,
+    joint_start,
+    joint_support,
+    outlier_images,
+    outlier_planes,
+    with_islands,
+    with_turns,
+    write_outliers,
+)
 from casa_sara.imaging.plane_images import plane_images, point_spread
 from casa_sara.imaging.predict_model import save_model
 from casa_sara.imaging.run_solver import (
@@ -49,9 +60,10 @@ from casa_sara.imaging.run_solver import (
 from casa_sara.imaging.spectra import divided_by_band, spectral_images, with_subbands
 from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
 from casa_sara.imaging.total_power import total_power
+from casa_sara.operators.outliers import rotation, stacked
 from casa_sara.operators.subbands import Subbands
 from casa_sara.operators.widefield import WTerm
-from casa_sara.options import ImageGrid, ImagingRequest
+from casa_sara.options import ImageGrid, ImagingRequest, images_in, stacked_shape
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
@@ -61,7 +73,7 @@ from casa_sara.reconstruction.total_power import TotalPower
 from casa_sara.runtime.deadline import Deadline
 
 __all__ = [
-    "Result", "Split", "after_iterations", "describe", "make_image", "split",
+    "Plane", "Result", "Split", "after_iterations", "caution", "describe", "make_image", "read_data", "split",
 ]
 
 MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
@@ -74,8 +86,9 @@ class Result:
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
     from the data, relative to the MS weights; `forecast` is the forecast of memory and time made before; `suspects`
-    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`; `subbands` are those of unknown spectra. With
-    several ranks, each has its own samples in `data`, and `size` is the number of all.
+    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`; `subbands` are those of unknown spectra, and
+    `outliers` what was found in the images elsewhere. With several ranks, each has its own samples in `data`, and
+    `size` is the number of all.
     """
 
     data: Visibilities
@@ -88,6 +101,7 @@ class Result:
     forecast: dict
     suspects: list = field(default_factory=list)
     subbands: Subbands | None = None
+    outliers: list[OutlierResult] = field(default_factory=list)
 
     @property
     def finished(self) -> bool:
@@ -138,10 +152,10 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
         comm.once(checkpoint.open)
     with waiting_child(write_images) if comm.rank == 0 else nullcontext() as child:  # it starts while CASA reads
         with kernels_loading(log.info):
-            data, plane = _read(request, ranks, scratch_of(output.imagename, forecast.workload))
+            data, plane = read_data(request, ranks, scratch_of(output.imagename, forecast.workload))
         if output.images_stand:
             return _complete(request, plane, data, forecast, comm)
-        part = split(data, output.blocks, comm, plane.grid.subbands)
+        part = split(data, output.blocks, comm, plane.grid.subbands, plane.grid.outliers)
         del data  # the same samples, not yet sorted
         _check(request, plane, part, comm)
         watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
@@ -149,23 +163,27 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
         images = plane_images(solution.part.data, solution.seen, plane.grid, request.weighting, request.options,
                               plane.image_plane, comm)
         images.pixels["model"] = solution.model
+        others = outlier_images(plane.outliers, solution, images, request.options)
         doubtful = _look_back(images, plane, solution, comm)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         result = solution.result(images, doubtful, forecast, plane.grid.subbands, comm)
+        result.outliers = others
+        write_outliers(output, plane.outliers, others)
         comm.once(_write, request, plane, images, solution, record and record(result), child)
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
-        comm.once(save_model, request.selection, solution.part.data, plane.grid, request.options, solution.model)
+        comm.once(save_model, request.selection, solution.part.data, plane.grid, request.options, solution.stacked)
     return result
 
 
 @dataclass(frozen=True)
-class _Plane:
+class Plane:
     """The plane of the image: `grid` is what was asked for, with the spectrum that belongs to the plane.
 
-    `startmodel` real (nx, ny) in Jy/pixel, `support` bool (nx, ny) and `dish`, what a single dish tells of the sky, are
-    None where there is none.
+    `startmodel` real (nx, ny) in Jy/pixel, or (S, nx, ny) of several Stokes parameters, `support` bool (nx, ny) and
+    `dish`, what a single dish tells of the sky, are None where there is none; the first is of the image and its
+    `outliers` together, stacked, where there are some.
     """
 
     image_plane: ImagePlane
@@ -173,21 +191,37 @@ class _Plane:
     startmodel: np.ndarray | None
     support: np.ndarray | None = None
     dish: TotalPower | None = None
+    outliers: tuple[OutlierPlane, ...] = ()
+
+    @property
+    def stacked_support(self):
+        """The support of the image and its outliers together."""
+        return joint_support(self.support, self.grid, self.outliers)
 
 
 @dataclass(frozen=True)
 class _Solution:
-    """A model and the samples that it was made of; without `reconstruction` it is the one to start from."""
+    """A model and the samples that it was made of; without `reconstruction` it is the one to start from.
+
+    `outliers` are the models of the outliers, and `islands` of each what was found in it.
+    """
 
     model: np.ndarray
     part: Split
     reconstruction: Reconstruction | None = None
+    outliers: Sequence[np.ndarray] = ()
+    islands: Sequence[list] = ()
+
+    @property
+    def stacked(self):
+        """The model, in one array with those of the outliers."""
+        return stacked([self.model, *self.outliers]) if self.outliers else self.model
 
     @property
     def seen(self):
-        """The model, at all frequencies that were solved for where these are several."""
+        """The same, at all frequencies that were solved for where these are several."""
         spectra = self.reconstruction and self.reconstruction.spectra
-        return self.model if spectra is None else spectra
+        return self.stacked if spectra is None else spectra
 
     def result(self, images, doubtful, forecast, subbands, comm):
         """Return what the task tells of it."""
@@ -196,8 +230,24 @@ class _Solution:
                       images.model_flux, forecast.summary(), doubtful, subbands)
 
 
-def _read(request, ranks, scratch):
-    """Return this rank's visibilities, and the plane of the image with its first model and support."""
+def read_data(request, ranks, scratch):
+    """Return this rank's visibilities, and the plane of the image with its first model and support.
+
+    Parameters
+    ----------
+    request : ImagingRequest
+        What the task was asked for.
+    ranks : casa_sara.parallel.partition.RankAssignment
+        The ranks that read.
+    scratch : casa_sara.runtime.scratch.Scratch
+        Where the samples go.
+
+    Returns
+    -------
+    data : Visibilities
+    plane : Plane
+        Of several Stokes parameters that of the first, with the first models of all.
+    """
     grid, output, comm = request.grid, request.output, ranks.comm
     frequencies = grid.needs_frequencies
     data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks, scratch)
@@ -206,6 +256,8 @@ def _read(request, ranks, scratch):
         data, grid = with_beams(data, request.selection, grid)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
+    grid = with_turns(grid, data)
+    outliers = outlier_planes(request, data, grid)
     if grid.is_mosaic:
         weights = imaging_weights(data, grid, request.weighting, comm)
         plane = plane.of_mosaic(weight_image(data, grid, weights), output.pblimit)
@@ -213,15 +265,24 @@ def _read(request, ranks, scratch):
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
-    _caution(data)
+    caution(data)
     grid = comm.once(with_spectrum, with_subbands(grid, data, plane), plane)
-    start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
+    start = joint_start(comm.once(_startmodel, output, plane, grid.stokes), grid, outliers)
     if output.images_stand:
-        return data, _Plane(plane, grid, start)
-    support = comm.once(read_support, grid, plane)
-    if support is not None and start is not None:
-        start *= support
-    return data, _Plane(plane, grid, start, support, dish)
+        return data, Plane(plane, grid, start)
+    found = Plane(plane, grid, start, comm.once(read_support, grid, plane), dish, outliers)
+    if found.stacked_support is not None and start is not None:
+        start *= found.stacked_support
+    return data, found
+
+
+def _startmodel(output, plane, stokes):
+    """Return the first model, of each of several Stokes parameters; None where there is none."""
+    if not output.startmodel or output.resume:
+        return None
+    if len(stokes) == 1:
+        return read_model(output.startmodel, plane)
+    return np.array([read_model(output.startmodel, plane.of_stokes(stokes), number) for number in range(len(stokes))])
 
 
 def _complete(request, plane, data, forecast, comm):
@@ -247,15 +308,19 @@ def _solve(request, plane, part, watch, ranks):
     """Find the model, within the time that writing leaves, and leave out the samples that it left out."""
     options, grid, comm, data = request.options, plane.grid, ranks.comm, part.data
     if options.niter == 0:
-        return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
+        start = np.zeros(stacked_shape(grid.shapes), np.float32) if plane.startmodel is None else plane.startmodel
+        main, *others = map(np.ascontiguousarray, images_in(start, grid.shapes))
+        return _Solution(main, part, outliers=others, islands=[[]] * len(others))
     watch.deadline.reserve = after_iterations(comm.total(data.size), grid.shape, request.output, request.limits,
                                               watch.deadline.elapsed()) + error_seconds(options, grid.shape)
     samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise,
                       total_power=plane.dish)
-    found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, ranks)
+    found = solve_image(samples, grid, options, plane.startmodel, watch, plane.stacked_support, ranks)
+    islands = with_islands(found.record, plane.outliers, options.significance)
     list_islands(found.record, plane.image_plane, grid.cell_rad, options.significance, comm)
     used, blocks = without_wild(data, part.blocks, part.offsets, found, comm)
-    return _Solution(found.model, Split(used, blocks, np.searchsorted(found.kept, part.offsets), part.noise), found)
+    return _Solution(found.model, Split(used, blocks, np.searchsorted(found.kept, part.offsets), part.noise), found,
+                     found.outliers, islands)
 
 
 def _look_back(images, plane, solution, comm):
@@ -266,13 +331,13 @@ def _look_back(images, plane, solution, comm):
     for line in named_suspects(part.blocks, doubtful):
         log.warn(line)
     if plane.dish is None:
-        _caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
+        caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
     if plane.support is not None:
         pixels["mask"] = check_confined(pixels["model"], plane.support)
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
         if "weight" in pixels:  # of flat noise
             sigma /= float(pixels["weight"].max()) ** 0.5
-        _caution(data, left_outside(pixels["residual"], plane.support, sigma))
+        caution(data, left_outside(pixels["residual"], plane.support, sigma))
     return doubtful
 
 
@@ -289,7 +354,7 @@ def _write(request, plane, images, solution, record, child):
     write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child)
 
 
-def split(data, blocks, comm=SERIAL, subbands=None):
+def split(data, blocks, comm=SERIAL, subbands=None, outliers=()):
     """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`).
 
     Parameters
@@ -302,6 +367,8 @@ def split(data, blocks, comm=SERIAL, subbands=None):
         Over whose ranks the samples are spread.
     subbands : Subbands, optional
         Parts of the band that have blocks of their own.
+    outliers : sequence of Outlier
+        What they hold is no noise either.
 
     Returns
     -------
@@ -309,12 +376,20 @@ def split(data, blocks, comm=SERIAL, subbands=None):
     """
     block_of_sample, infos = divided_by_band(*divide(data, blocks, comm), data, subbands)
     data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
-    noise = noise_from_differences(data, offsets, comm)
+    noise = noise_from_differences(data, offsets, comm, [rotation(data.uvw, outlier) for outlier in outliers])
     return Split(data, infos, offsets, noise)
 
 
-def _caution(data, notes=None):
-    """Warn of these notes, which the record keeps too, or of those that are there."""
+def caution(data, notes=None):
+    """Warn of these notes, which the record keeps too, or of those that are there.
+
+    Parameters
+    ----------
+    data : Visibilities
+        Whose notes are those of the record.
+    notes : list of str, optional
+        New ones.
+    """
     for note in data.notes if notes is None else notes:
         log.warn(note)
     data.notes.extend(notes or [])
