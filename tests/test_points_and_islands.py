@@ -5,10 +5,11 @@ import pytest
 from fourier_sums import BEAM, NOISE, Sums, distance, gaussian, image, pixel, problem
 from scipy.optimize import nnls
 
-from casa_sara.solver.islands import islands_of, look_at
+from casa_sara.solver.islands import islands_of
 from casa_sara.solver.matched_filter import MatchedFilter
 from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.record import SolverRecord
+from casa_sara.solver.residual_structure import look_at
 from casa_sara.solver.significance import gradient_image, matched_filter
 from casa_sara.solver.unresolved import unresolved
 

@@ -10,8 +10,8 @@ from casa_sara.casa.images.image_plane import ImagePlane
 from casa_sara.casa.images.island_positions import located
 from casa_sara.casa.runtime import log
 from casa_sara.parallel.serial import SERIAL, Serial
-from casa_sara.solver.islands import STRUCTURE
 from casa_sara.solver.record import SolverRecord
+from casa_sara.solver.residual_structure import STRUCTURE
 
 __all__ = ["list_islands"]
 
@@ -60,6 +60,11 @@ def _log_islands(record, significance, cell_rad):
     if faint:
         log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")
     _compare_errors(islands)
+    if record.gain_errors:
+        log.warn("the residual shows errors of the antenna gains that change from {interval} to {interval}: "
+                 "{amplitude:.2%} in amplitude and {degrees:.2g} degrees in phase (rms). What they explain is not "
+                 "taken for emission; self-calibration would remove them"
+                 .format(**record.gain_errors, degrees=math.degrees(record.gain_errors["phase"])))
     worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"],
                 default=None)
     if worst and worst["snr"] > STRUCTURE:

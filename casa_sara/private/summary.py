@@ -224,6 +224,7 @@ def _solution(result, options, full):
         sara["averaging"] = dict(solved.averaging)
         sara["islands"] = [dict(island) for island in record.islands]
         sara["residual_snr"] = [dict(peak) for peak in record.residual_snr]
+        sara["gain_errors"] = dict(record.gain_errors)
         if solved.draws is not None:
             sara["draws"] = {"asked": options.ndraws, "made": len(solved.draws)}
         if solved.jackknife is not None:

@@ -26,6 +26,7 @@ from casa_sara.operators.subbands import SubbandDictionary
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
+from casa_sara.reconstruction.calibration import Calibration
 from casa_sara.reconstruction.total_power import Beside, TotalPower, WhitenedDish
 from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import NNLSFit, nnls
@@ -135,6 +136,7 @@ class Problem:
     dish: WhitenedDish | None = None
     subbands: Any = None
     shapes: tuple[tuple[int, int], ...] = ()
+    calibration: Calibration | None = None
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - four have a default
@@ -174,6 +176,7 @@ class Problem:
         vis: Any = None if data.scratch.on_disk else data.vis * np.sqrt(data.weight)
         measurement = _whitened_operator(data, operator, grid, options, unit_jy)
         precond = of_samples = _preconditioner(samples, options.precondition, comm, grid.subbands)
+        calibration = None if vis is None else Calibration(data, vis, offsets, measurement, comm)
         averaged = None
         if options.averages and grid.mosaic is None:
             averaged, uvw, freq_hz = _averages(partial(Averaged.of, data, offsets, averaging_cell(grid), vis=vis,
@@ -199,7 +202,7 @@ class Problem:
         if support is not None and grid.subbands is not None:
             support = np.tile(support, (grid.subbands.n_terms, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
-                   grid.mosaic and grid.mosaic.over, dish, grid.subbands, grid.shapes)
+                   grid.mosaic and grid.mosaic.over, dish, grid.subbands, grid.shapes, calibration)
 
     def dictionary(self, wavelets: tuple[str, ...], options: SolverOptions) -> Any:
         """Return Ψ of the image, or of all that are stacked.

@@ -74,6 +74,7 @@ class Solution:
             ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond,
                               found.data_norm_sq, options.positivity, comm=ranks.comm)
         ppd.unit_jy, ppd.averaged, ppd.sky_over_image = problem.unit_jy, problem.renewing, problem.sky_over_image
+        ppd.calibration = problem.calibration
         ppd.planes = planes
         ppd.samples = ranks.comm.exscan(problem.block_sizes)[1]
         if problem.support is not None:

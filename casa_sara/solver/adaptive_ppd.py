@@ -91,6 +91,9 @@ class AdaptivePPD:
     averaged : object or None
         What links averaged samples to those that they are averages of, by `renew(model, predicted)`: see
         :meth:`renew_averages`.
+    calibration : object or None
+        What knows which artefacts errors of the antenna gains make of a model: see
+        :meth:`casa_sara.solver.significance.SignificantSupport.update`.
     samples : int (d,)
         M_j, samples of each block, before they were averaged.
     scatter : float (d,)
@@ -163,6 +166,7 @@ class AdaptivePPD:
         self.multipliers, self.l2_bounds, self.constrained = np.zeros(self.n_blocks), np.zeros(self.n_blocks), False
         self.begins, self.block_sizes = comm.exscan(np.diff(self.offsets))
         self.averaged: Any = None
+        self.calibration: Any = None
         self.samples, self.scatter = self.block_sizes, np.zeros(self.n_blocks)
         self.correction: np.ndarray | None = None
         self.residual_norms = comm.norms(np.array([np.linalg.norm(vis[a:b]) for a, b in self.blocks()]))

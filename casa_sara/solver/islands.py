@@ -1,61 +1,17 @@
-"""The islands of emission of the model, and the significance of the residual."""
+"""The islands of emission of a model: what there is of them, and which are faint."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import zip_longest
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, find_objects, label
 
-from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.convolution import convolve_valid
-from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
-from casa_sara.solver.matched_filter import BEAMS, SIGMA_TO_FWHM
-from casa_sara.solver.record import SolverRecord
-from casa_sara.solver.significance import gradient_image, matched_filter
+from casa_sara.solver.matched_filter import SIGMA_TO_FWHM
 
-__all__ = ["STRUCTURE", "add_flux_errors", "islands_of", "look_at"]
-
-STRUCTURE = 5.0  # standard deviations over a beam or more, from which on a residual is not noise
-
-
-def look_at(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, record: SolverRecord) -> bool:
-    """Note in the record the islands of the model and the peaks of the residual, where a support confines the model.
-
-    Parameters
-    ----------
-    ppd : AdaptivePPD
-        The iteration at its end, whose model and residual are looked at.
-    bounds : GivenBounds or AdaptiveBounds
-        Bounds of its blocks, from which the noise levels follow.
-    record : SolverRecord
-        `islands` and `residual_snr` are set; islands of other parts of the sky than the first have its number `part`.
-
-    Returns
-    -------
-    bool
-        Whether the residual holds structure of more than 5 standard deviations over more than a beam.
-    """
-    planes = ppd.planes
-    filters = [matched_filter(ppd, bounds, part) for part in range(len(planes.parts))]
-    gradients = planes.means(gradient_image(ppd, bounds, ppd.model))
-    peaks = [ppd.comm.once(_peaks, *one) for one in zip(filters, gradients)]
-    record.residual_snr = [max(of_width, key=lambda peak: peak["snr"]) for of_width in zip_longest(
-        *peaks, fillvalue=dict(snr=-np.inf))]
-    record.islands = []
-    for part, (model, filter_) in enumerate(zip(planes.looked_at(ppd.model), filters)):
-        islands = ppd.comm.once(islands_of, model, filter_.psf, ppd.unit_jy, ppd.sky_over_image)
-        record.islands += islands if part == 0 else [island | dict(part=part) for island in islands]
-    return any(entry["snr"] > STRUCTURE for entry in record.residual_snr if entry["beams"] >= 1)
-
-
-def _peaks(filter_, gradient):
-    """Largest |S/N| of the residual at every width."""
-    spectrum = filter_.spectrum(gradient)
-    return [dict(beams=beams, snr=float(np.abs(filter_.snr(spectrum, scale)).max()))
-            for scale, beams in enumerate(BEAMS[:len(filter_.widths)])]
+__all__ = ["add_flux_errors", "faint_islands", "islands_of"]
 
 
 def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0,
@@ -91,13 +47,38 @@ def islands_of(model: np.ndarray, psf: np.ndarray, unit_jy: float = 1.0,
         x, y = (np.arange(s.start, s.stop) for s in box)
         centre = [float(size.sum(axis=1) @ x / total), float(size.sum(axis=0) @ y / total)]
         spread = (size.sum(axis=1) @ (x - centre[0]) ** 2 + size.sum(axis=0) @ (y - centre[1]) ** 2) / total
-        snr = float(np.sqrt(max(np.vdot(part, _response(part, psf)), 0.0)))
+        snr = _snr(part, psf)
         flux = float((part if sky_over_image is None else part * sky_over_image[box]).sum() * unit_jy)
         peak = np.unravel_index(np.abs(part).argmax(), part.shape)
         found.append(dict(x=centre[0], y=centre[1], x_peak=int(x[peak[0]]), y_peak=int(y[peak[1]]), flux_jy=flux,
                           flux_error_jy=abs(flux) / max(snr, 1e-30), snr=snr, pixels=int(np.count_nonzero(part)),
                           fwhm_pixels=float(SIGMA_TO_FWHM * np.sqrt(max(0.5 * spread, 0.0)))))
     return sorted(found, key=lambda island: -island["snr"])
+
+
+def faint_islands(model: np.ndarray, psf: np.ndarray, snr: float) -> np.ndarray:
+    """Return the pixels of the islands that have less than a signal-to-noise ratio.
+
+    Parameters
+    ----------
+    model : real (nx, ny)
+        x.
+    psf : real (nx, ny)
+        Φ†Σ⁻¹Φ of a pixel of 1 at (nx // 2, ny // 2).
+    snr : float
+        The S/N, that of :func:`islands_of`.
+
+    Returns
+    -------
+    bool (nx, ny)
+    """
+    labels, number = _labelled(model)
+    faint = np.zeros(number + 1, bool)
+    most = np.sqrt(psf[tuple(n // 2 for n in psf.shape)])  # of all flux in one pixel
+    for index, box in zip(range(1, number + 1), find_objects(labels)):
+        part = np.where(labels[box] == index, model[box], 0).astype(float)
+        faint[index] = most * np.abs(part).sum() < snr or _snr(part, psf) < snr
+    return faint[labels]
 
 
 def _labelled(model):
@@ -129,6 +110,11 @@ def add_flux_errors(islands: list[dict[str, Any]], model: np.ndarray, flux_error
     errors = flux_errors(labels[tuple(nearest)])
     for island in islands:
         island[name] = float(errors[labels[island["x_peak"], island["y_peak"]] - 1])
+
+
+def _snr(part, psf):
+    """‖Σ^{−½}Φ·‖ of a part of the image."""
+    return float(np.sqrt(max(np.vdot(part, _response(part, psf)), 0.0)))
 
 
 def _response(part, psf):

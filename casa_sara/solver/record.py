@@ -50,6 +50,9 @@ class SolverRecord:
         Of the model, see :func:`casa_sara.solver.islands.islands_of`.
     residual_snr : list of dict
         Largest S/N of the residual, `snr`, smoothed to `beams`.
+    gain_errors : dict
+        Errors of the antenna gains that the residual showed at the last re-weighting: `interval` within which they
+        stay, rms of `amplitude` (relative) and `phase` (rad), `significance` (standard deviations); empty without.
     resumed : list of int
         The iterations of the checkpoints from which the solution was resumed.
     stop_code : int
@@ -66,6 +69,7 @@ class SolverRecord:
     reweightings: list[dict] = field(default_factory=list)
     islands: list[dict] = field(default_factory=list)
     residual_snr: list[dict] = field(default_factory=list)
+    gain_errors: dict[str, Any] = field(default_factory=dict)
     resumed: list[int] = field(default_factory=list)
     stop_code: int = 0
 

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
-from casa_sara.solver.islands import look_at
 from casa_sara.solver.l1_weights import first_weights, reweight
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.positivity import Release
@@ -22,6 +21,7 @@ from casa_sara.solver.record import (
     UNFEASIBLE,
     SolverRecord,
 )
+from casa_sara.solver.residual_structure import look_at
 from casa_sara.solver.significance import SignificantSupport
 
 __all__ = ["Schedule", "Stage", "Steps", "algorithm_2", "run_algorithm_2", "stepped"]
@@ -32,7 +32,7 @@ Steps = Generator[tuple[AdaptivePPD, GivenBounds | AdaptiveBounds], None, Any]
 RISE = 1.05  # of the residual norm within one interval, from its least
 STEADY = 3e-3  # relative change of the residual norm within one interval
 FIRST_SCALE, LAST_SCALE = 10.0, 1.5  # α, in units of the noise of each band
-RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold
+RELEASE_SCALE = 4.0  # α from which on the residual shows what positive pixels cannot hold, and errors of gains
 FIRST_INTERVALS = 2  # of the first problem, whose model starts from nothing
 NEARLY = 2.0  # bounds may be off by so many of their tolerances where the model changes by one of its own over this
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
@@ -312,7 +312,10 @@ def _renew_weights(ppd, bounds, schedule, stage):
     if scale <= LAST_SCALE and not released and _is_settled(ppd, bounds, schedule, change):
         return False
     support = stage.support
-    pixels = support.update(ppd, bounds) if support else ppd.model.size
+    calibration = ppd.calibration if scale <= RELEASE_SCALE else None
+    pixels = support.update(ppd, bounds, calibration) if support else ppd.model.size
+    if calibration is not None:
+        stage.record.gain_errors = calibration.summary
     reweight(ppd, bounds, max(scale, LAST_SCALE), support is not None)
     stage.record.reweightings.append(dict(iteration=ppd.iteration, scale=max(scale, LAST_SCALE), model_change=change,
                                           released=released, support=pixels))

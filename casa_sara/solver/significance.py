@@ -8,12 +8,14 @@ for.  Within it the prior needs to hold less (:mod:`casa_sara.solver.l1_weights`
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, label
 
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.islands import faint_islands
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
 from casa_sara.solver.matched_filter import MatchedFilter
 from casa_sara.solver.point_sources import PointSources
@@ -52,7 +54,7 @@ class SignificantSupport:
         self._psfs: list[np.ndarray] = []
         self._filters: list[MatchedFilter | None] = []
 
-    def update(self, ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> int:
+    def update(self, ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, calibration: Any = None) -> int:
         """Confine the model to what is significant now.
 
         Parameters
@@ -61,6 +63,9 @@ class SignificantSupport:
             Its support is changed, and its point sources.
         bounds : GivenBounds or AdaptiveBounds
             Whose noise levels are the noise.
+        calibration : object or None
+            What knows which artefacts errors of the antenna gains make of a model, by `artefacts(model, noise_weights,
+            in_doubt)`: they are not emission.
 
         Returns
         -------
@@ -68,11 +73,16 @@ class SignificantSupport:
             Pixels of the support.
         """
         planes = ppd.planes
-        gradients = planes.means(gradient_image(ppd, bounds, ppd.model))
+        gradient = gradient_image(ppd, bounds, ppd.model)
         if self._noise_weights is None or not np.array_equal(self._noise_weights, bounds.noise_weights):
-            self._psfs = [point_response(ppd, bounds, part) for part in range(len(gradients))]
-            self._filters, self._noise_weights = [None] * len(gradients), bounds.noise_weights
-        images = zip(gradients, planes.means(ppd.model), planes.allowed(ppd.confined_to, ppd.model))
+            self._psfs = [point_response(ppd, bounds, part) for part in range(len(planes.parts))]
+            self._filters, self._noise_weights = [None] * len(planes.parts), bounds.noise_weights
+        artefacts = None
+        if self.begun and calibration is not None:
+            artefacts = calibration.artefacts(ppd.model, bounds.noise_weights, partial(self._faint, ppd))
+        without = planes.means(gradient if artefacts is None else gradient - artefacts)
+        images = zip(planes.means(gradient), without, planes.means(ppd.model),
+                     planes.allowed(ppd.confined_to, ppd.model))
         found = [ppd.comm.once(self._found, part, *image, ppd.positivity, ppd.measurement.workers.count)
                  for part, image in enumerate(images)]
         self.begun = True
@@ -80,8 +90,14 @@ class SignificantSupport:
         ppd.support_only(planes.joined(supports), planes.points(points, ppd.model.shape))
         return int(sum(map(np.count_nonzero, supports)))
 
-    def _found(self, part, gradient, model, allowed, positivity, workers):
-        """Return the support of one part of the sky and the point sources in it."""
+    def _faint(self, ppd, snr):
+        """The part of the model whose islands have less than a signal-to-noise ratio."""
+        faint = [ppd.comm.once(faint_islands, model, psf, snr)
+                 for model, psf in zip(ppd.planes.means(ppd.model), self._psfs)]
+        return np.where(ppd.planes.joined(faint), ppd.model, ppd.model.dtype.type(0))
+
+    def _found(self, part, whole, gradient, model, allowed, positivity, workers):
+        """Return the support of one part of the sky and the point sources in it; `whole` is with artefacts."""
         self._filters[part] = filter_ = self._filters[part] or MatchedFilter(self._psfs[part], workers)
         signed = (lambda snr: snr) if positivity else np.abs
         spectrum = filter_.spectrum(gradient)
@@ -90,16 +106,16 @@ class SignificantSupport:
             level = np.clip(filter_.sidelobe * snr.max(), self.significance, SURE * self.significance)
             support = _connected(snr, level)
         else:
-            support = self._grown(filter_, spectrum, model, signed)
+            excess = _excess(filter_.snr(filter_.spectrum(whole), 0), model == 0)
+            support = self._grown(filter_, spectrum, model, signed, self.significance * excess)
         if not positivity or not support.any():
             return support, PointSources()
         return unresolved(filter_, gradient, model, support, allowed, self.significance)
 
-    def _grown(self, filter_, spectrum, model, signed):
-        """The support of a model that a support has confined already."""
+    def _grown(self, filter_, spectrum, model, signed, significance):
+        """The support of a model that a support has confined already, of what is as significant."""
         found = np.zeros(model.shape, bool)
         rim, empty = found.copy(), model == 0
-        significance = self.significance * _excess(filter_.snr(spectrum, 0), empty)
         for scale, width in enumerate(filter_.widths):
             snr = filter_.snr(spectrum, scale)
             level = max(significance, filter_.sidelobe * float(signed(snr).max(initial=0, where=empty)))
