@@ -142,8 +142,8 @@ def test_what_several_do_not_have_is_refused(observed, given, message):
 
 
 def test_a_dry_run_counts_all_of_them(observed):
-    one, four = (tsara(vis=observed["circular"], imagename="x", stokes=stokes, polbound=True, dryrun=True, **GRID)["forecast"]
-                 for stokes in ("I", "IQUV"))
+    given = dict(vis=observed["circular"], imagename="x", polbound=True, dryrun=True) | GRID
+    one, four = (tsara(stokes=stokes, **given)["forecast"] for stokes in ("I", "IQUV"))
     part = "wavelet duals and weights"
     assert four["memory_bytes"]["iterating"][part] == 3 * one["memory_bytes"]["iterating"][part]
     assert four["memory_bytes"]["reading"]["further Stokes parameters"] == 36 * four["visibilities"]
