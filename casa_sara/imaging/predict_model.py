@@ -13,6 +13,7 @@ from casa_sara.casa.runtime import log
 from casa_sara.imaging.mosaic import MosaicModel, beams_record
 from casa_sara.imaging.plane_images import IMAGE_EPS
 from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.subbands import Subbands
 from casa_sara.options import ImageGrid, Selection, Spectrum
 
 __all__ = ["save_model", "write_column"]
@@ -21,21 +22,25 @@ __all__ = ["save_model", "write_column"]
 def save_model(selection, data, grid, options, model, axis=None):
     """Write the model's visibilities into the MeasurementSets: the last phase, after the images are complete.
 
-    The model (nchan, nx, ny) of a cube comes with its spectral axis.
+    The model (nchan, nx, ny) of a cube comes with its spectral axis; with `grid.subbands` it is that at these
+    frequencies, (T, nx, ny), or (nx, ny) where it is the same at all of them.
     """
     log.info("writing MODEL_DATA")
     save_model_column(selection.vis, write_column, selection=asdict(selection), phase_center=data.phase_center,
                       cell_rad=grid.cell_rad, gridder=grid.gridder, spectrum=grid.spectrum and asdict(grid.spectrum),
-                      nthreads=options.nthreads, model=model,
+                      nthreads=options.nthreads, model=model, subbands=grid.subbands and asdict(grid.subbands),
                       beams=beams_record(data, grid) if grid.is_mosaic else None, axis=axis and vars(axis))
 
 
 def write_column(selection, phase_center, cell_rad, gridder, spectrum, nthreads, model,  # noqa: PLR0913 - of a message
-                 beams=None, axis=None):
+                 beams=None, axis=None, subbands=None):
     """Predict the visibilities of a model and write them: what `save_model_column` has a child process do."""
     chosen = Selection(**{name: tuple(value) if isinstance(value, list) else value
                           for name, value in selection.items()})
-    grid = ImageGrid(model.shape[-2:], tuple(cell_rad), gridder=gridder, spectrum=spectrum and Spectrum(**spectrum))
+    grid = ImageGrid(model.shape[-2:], tuple(cell_rad), gridder=gridder, spectrum=spectrum and Spectrum(**spectrum),
+                     subbands=subbands and Subbands(**subbands))
+    if grid.subbands is not None:
+        model = grid.subbands.stacked(model)
     accuracy = dict(eps=IMAGE_EPS, nthreads=nthreads)
     if beams is not None:
         predict = MosaicModel(model, grid, chosen, phase_center, beams, accuracy)

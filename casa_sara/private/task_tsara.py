@@ -243,8 +243,6 @@ def _refuse_for_spectra(parameters):
                                 ("positivity", True, "the brightness is positive at all frequencies"),
                                 ("spectralindex", "", "either the index is known, or it is solved for"),
                                 ("parallel", False, "spectra take one process"),
-                                ("report", False, "reports are made of one image"),
-                                ("savemodel", "none", "MODEL_DATA is written of one image"),
                                 ("ndraws", 0, "errors by bootstrap are of one image"),
                                 ("jackknife", False, "errors by jackknife are of one image")):
         if parameters[name] != right:
