@@ -186,9 +186,9 @@ def _check_errors(parameters):
     """Raise where errors are asked for that cannot be found."""
     for name, right in (("ndraws", 0), ("jackknife", False)):
         value = parameters[name]
-        if value and parameters["specmode"] == "cube":
-            raise ValueError(f"{name} = {value} with specmode = 'cube': errors are found for continuum images only; "
-                             f"should be {right}")
+        if value and parameters["specmode"] == "cube" and parameters["restoringbeam"] in ("common", ["common"]):
+            raise ValueError(f"{name} = {value} with restoringbeam = 'common': the errors of a cube are smoothed to "
+                             "the beam of each channel; should be '', or the beam itself")
         if value and parameters["niter"] == 0:
             raise ValueError(f"{name} = {value} with niter = 0: errors are those of a model that was solved; should be "
                              f"{right}")
