@@ -46,7 +46,7 @@ ERRORS = 10  # images of errors, and of the smoothing
 MIXED, INDEXED = 2, 8  # of each image where several frequencies are solved for; of their smoothed ones
 TURNED = 8  # bytes of a sample of each outlier: its rotation, and once what an image contributes
 CONTRIBUTED = 8  # bytes of a sample, of each of these
-CUBES = 3  # psf, residual and model of each channel
+CUBES, CUBES_OF_ERRORS = 3, 3  # psf, residual and model of each channel; its images of errors
 MASK = 1.25  # of each channel of a cube, as it is used and as it is written
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
@@ -129,14 +129,17 @@ class Workload:
         one = replace(self, samples=math.ceil(self.samples * self.share), channels=0).memory()
         one.pop("reading")
         writing = one.pop("writing")
+        cubes = CUBES + CUBES_OF_ERRORS * bool(self.draws)
         held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
-                "cubes": self._planes((PLANE + CUBES + MASK * self.masked) * self.channels)}
+                "cubes": self._planes((PLANE + cubes + MASK * self.masked) * self.channels)}
+        if self.draws:
+            held["draws of all channels"] = self._drawn() * self.channels
         reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples,
                    "while reading": READING * self.samples}
         return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
                 "images of a channel": writing | held,
                 "writing": {"libraries": LIBRARIES, **held,
-                            "process that writes": self._planes((PLANE + CUBES + MASK * self.masked + 1)
+                            "process that writes": self._planes((PLANE + cubes + MASK * self.masked + 1)
                                                                 * self.channels)}}
 
     def _on_disk(self):

@@ -232,7 +232,7 @@ class _tsara:
         becomes narrower with frequency: beyond the middle of the field .alpha is steeper than that
         of the sky. With gridder='mosaic', for one pointing too, they are those of the sky: the
         primary beams of every frequency are in the model. Not with gridder='wproject',
-        spectralindex, report, savemodel, ndraws, jackknife, parallel.
+        spectralindex, ndraws, jackknife, parallel.
         Example: nterms=3
 
     nchan : int, default -1
@@ -575,7 +575,8 @@ class _tsara:
         beam lies within 1 error in 55 to 75 % of the pixels with S/N above 5, within 2 in 85 to 96 %.
         A draw takes 90 iterations, 20 draws 3 to 7 times as long as the run itself. Ctrl-C ends the
         draws with the errors that those made so far give; restart=True makes the others. For
-        continuum images with method='tsara'; 2 draws or more.
+        method='tsara'; 2 draws or more. Those of a cube are made channel by channel, and are not
+        kept; its restoringbeam cannot be 'common'.
 
     jackknife : bool, default False
         True divides the data blocks (see blocks) into up to 10 groups, and solves again without each
@@ -584,8 +585,8 @@ class _tsara:
         Jy/beam, and jackknife_error_jy of each island. With ndraws, the log compares both, and warns
         where they differ by more than a factor of 2. It also contains what the uv coverage of a
         group alone tells of the sky, and is then too large; where groups are few it is uncertain, by
-        a quarter with 10. Needs 4 blocks or more; for continuum images with method='tsara'. A group
-        takes as long as a draw of ndraws.
+        a quarter with 10. Needs 4 blocks or more (of a cube in each channel), and method='tsara'. A
+        group takes as long as a draw of ndraws.
 
     blocks : int or str or list of str, default 0
         0 makes one block of each MeasurementSet, observation and scan, and splits long scans in time,
