@@ -229,7 +229,6 @@ def test_averages_are_counted_where_visibilities_are_averaged():
     assert solver_samples(replace(volume, samples=1000), grid, SolverOptions()) == 500
     for options in (SolverOptions(averaging=False), SolverOptions(method="dabbech2018")):
         assert solver_samples(volume, grid, options) == 1_000_000
-    assert solver_samples(volume, replace(grid, gridder="mosaic"), SolverOptions()) == 1_000_000
 
 
 def test_what_does_not_fit_is_spread_further():

@@ -279,7 +279,9 @@ def _look_back(images, plane, solution, comm):
 def _write(request, plane, images, reconstruction, record, child):
     """Write the products, with the errors that the draws give."""
     draws, jackknife = (reconstruction.draws, reconstruction.jackknife) if reconstruction else (None, None)
-    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
+    weight = images.pixels.get("weight")
+    pb = None if weight is None else np.sqrt(weight / weight.max())
+    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad, pb)
     if "model.error" in errors:
         errors["draws"] = draws.arrays()
     if reconstruction and reconstruction.spectra is not None:

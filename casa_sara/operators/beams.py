@@ -12,7 +12,7 @@ import numpy.typing as npt
 from casa_sara.operators._workers import Workers
 from casa_sara.runtime import jit
 
-__all__ = ["Beam", "Mosaic", "beam_at", "mosaic_density"]
+__all__ = ["Beam", "Mosaic", "around", "beam_at", "mosaic_density"]
 
 LEAST = 0.1  # of the largest sensitivity, that of the mosaic where it ends
 COARSE = 128  # pixels along an image in which the overlap of beams is summed
@@ -111,6 +111,23 @@ class Mosaic:
     over: np.ndarray | None = None
     profiles: Any = None
 
+    def middle(self, number: int) -> tuple[float, float, float]:
+        """Return the direction cosines (l, m, n) of the middle of the part of the image that a beam takes.
+
+        Parameters
+        ----------
+        number : int
+            Of the beam.
+
+        Returns
+        -------
+        (float, float, float)
+        """
+        box = self.beams[number].box(self.shape, self.cell_rad)
+        l, m = ((axis.start + (axis.stop - axis.start) // 2 - n // 2) * step
+                for axis, n, step in zip(box, self.shape, (-self.cell_rad[0], self.cell_rad[1])))
+        return l, m, float(np.sqrt(1 - l**2 - m**2))
+
     def sums(self, beam_of_sample: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Return the summed weight of the samples of each beam, float64 (number of beams,).
 
@@ -180,6 +197,28 @@ class Mosaic:
         over = np.zeros(self.shape, np.float32)
         np.divide(1, sensitivity, out=over, where=sensitivity > 0, casting="same_kind")
         return replace(self, over=over)
+
+
+def around(uvw: np.ndarray, middle: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return baselines around a place of the image, and the phase of that place: see `operators/mosaic.py`.
+
+    Parameters
+    ----------
+    uvw : float64 (3, M)
+        Wavelengths.
+    middle : (float, float, float)
+        Direction cosines (l0, m0, n0).
+
+    Returns
+    -------
+    uv : float64 (2, M)
+        (u − w l0/n0, v − w m0/n0).
+    turn : complex128 (M,)
+        exp(2πi [u l0 + v m0 + w (n0 − 1)]).
+    """
+    (u, v, w), (l, m, n) = uvw, middle
+    cycles = u * l + v * m + w * (n - 1)
+    return np.array([u - w * (l / n), v - w * (m / n)]), np.exp(2j * np.pi * (cycles - np.rint(cycles)))
 
 
 def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarray, mosaic: Mosaic) -> np.ndarray:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from casa_sara.operators._arguments import for_adjoint, for_forward
 from casa_sara.operators._workers import Workers
-from casa_sara.operators.beams import Mosaic, beam_at
+from casa_sara.operators.beams import Mosaic, around, beam_at
 from casa_sara.operators.measurement import MeasurementOperator, share_work_space
 from casa_sara.runtime import jit
 
@@ -128,13 +128,8 @@ class _Part:
         self.corner = tuple(axis.start for axis in self.box)
         self.scales, self.profile = beam.scales(cell), beam.profile.astype(dtype, copy=False)
         self.index = samples.astype(np.int32)
-        u, v, w = uvw[:, samples]
-        l, m = ((axis.start + size // 2 - n // 2) * step
-                for axis, size, n, step in zip(self.box, self.shape, mosaic.shape, (-cell[0], cell[1])))
-        n = np.sqrt(1 - l**2 - m**2)
-        cycles = u * l + v * m + w * (n - 1)
-        self.rotation = np.exp(2j * np.pi * (cycles - np.rint(cycles))).astype(np.result_type(dtype, np.complex64))
-        uv = np.array([u - w * (l / n), v - w * (m / n)])
+        uv, rotation = around(uvw[:, samples], mosaic.middle(number))
+        self.rotation = rotation.astype(np.result_type(dtype, np.complex64))
         self.operator = MeasurementOperator(uv, cell, self.shape, np.asarray(row_scale)[samples], eps, dtype, workers,
                                             (samples.size, _reach(uv, cell)))
 

@@ -201,9 +201,7 @@ def _refuse_for_mosaics(parameters):
     if parameters["gridder"] != "mosaic":
         return
     for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
-                                ("parallel", False, "a mosaic takes one process"),
-                                ("ndraws", 0, "errors by bootstrap are of single pointings only"),
-                                ("jackknife", False, "errors by jackknife are of single pointings only")):
+                                ("parallel", False, "a mosaic takes one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
 

@@ -96,13 +96,12 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     ------
     ValueError
         Noise levels that are neither one for all blocks nor one for each; too few blocks for a jackknife; errors
-        asked for of a mosaic, or with the paper's method; total power with errors, with bounds that do not adapt, or
-        on several ranks.
+        asked for with the paper's method; total power with errors, with bounds that do not adapt, or on several ranks.
     CheckpointError
         The state that was read is not one of these data.
     """
     comm, checkpoint = ranks.comm, control.checkpoint
-    _check(options, grid, samples, comm)
+    _check(options, samples, comm)
     flat = FlatNoise.of(samples.data, grid, comm)
     if flat is not None:
         grid, support, startmodel = flat.grid(grid), flat.support(support), flat.image(startmodel)
@@ -143,7 +142,7 @@ def _solve(solution, samples, averaging, options, control, layout, ranks):
         control.then(solution.ppd, solution.bounds, record)
 
 
-def _check(options, grid, samples, comm):
+def _check(options, samples, comm):
     """Raise where options, image and data do not go together."""
     blocks = len(samples.offsets) - 1
     if samples.total_power is not None:
@@ -151,10 +150,9 @@ def _check(options, grid, samples, comm):
     check_l2bound(options, blocks)
     if options.jackknife:
         jackknife_groups(blocks)
-    if (options.ndraws or options.jackknife) and (grid.mosaic is not None or options.method == PAPER):
-        what = "gridder = 'mosaic'" if grid.mosaic is not None else f"method = '{PAPER}'"
+    if (options.ndraws or options.jackknife) and options.method == PAPER:
         raise ValueError(f"ndraws = {options.ndraws}, jackknife = {options.jackknife}: should be 0 and False with "
-                         f"{what}, which has no errors of the model")
+                         f"method = '{PAPER}', which has no errors of the model")
 
 
 def _check_total_power(options, comm):
@@ -179,6 +177,7 @@ def _averaging(solution, sides):
 def _averaging_words(ppd, averaging, options, grid, sides):
     """Return the line of the log on it."""
     cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
+    within = "block" if grid.mosaic is None else "block, pointing and kind of baseline"
     if averaging:
         smaller = 2 ** max(averaging["halvings"])
         finer = f", or up to {smaller} times smaller" if smaller > 1 else ""
@@ -186,12 +185,10 @@ def _averaging_words(ppd, averaging, options, grid, sides):
         cell = f"uv cells of {u:.4g} x {v:.4g} wavelengths"
         count = ppd.samples[:len(averaging["halvings"])].sum()
         return (f"{count} visibilities are averaged to {averaging['averages']} for the solver, within each "
-                f"block and {cell}{finer}; for the first image the averages are wrong by up to "
+                f"{within} and {cell}{finer}; for the first image the averages are wrong by up to "
                 f"{averaging['largest_error']:.2g} of their noise, which is corrected at every re-weighting")
     if not options.averages:
         return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"
-    if grid.mosaic is not None:
-        return "visibilities are not averaged: gridder = 'mosaic'"
     return f"visibilities are not averaged: {cell} would leave more than half as many"
 
 
