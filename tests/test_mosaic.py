@@ -522,3 +522,19 @@ def test_vla_mosaic_has_casas_beam(folder, tmp_path, monkeypatch):
     assert np.abs(pixels("mosaic.pb") - pixels("plain.pb")).max() < 0.11  # 0 below the limit in one of them only
     good = pixels("plain.pb") > 0.12
     assert np.abs(pixels("mosaic.pb") - pixels("plain.pb"))[good].max() < 3e-3
+
+
+def test_fields_of_the_vla_do_not_widen_its_beam(folder):
+    """Two fields in one MeasurementSet and one in another: the beam of a pointing is that of the pointing alone."""
+    options = dict(antennas=4, spws=(("8.4GHz", "2MHz", 1),))
+    fields = [f"J2000 10h00m00s 20d0{minutes}m00s" for minutes in (0, 2, 4)]
+    names = (simulate(folder / "pair.ms", fields=fields[:2], **options),
+             simulate(folder / "third.ms", fields=fields[2:], **options))
+    found, grid = [], ImageGrid((160, 160), (np.radians(0.001),) * 2, fields[0], gridder="mosaic")
+    for selection in (Selection(names[:1], field="1", datacolumn="data"), Selection(names, datacolumn="data")):
+        data = read_visibilities(selection, grid.phasecenter, frequencies=True)
+        found.append(primary_beams(data, selection, grid))
+    alone, all_of_them = (one.profiles for one in found)
+    assert [len(one.centres) for one in found] == [1, 3]
+    np.testing.assert_allclose(all_of_them.radii, alone.radii, rtol=2e-3)
+    np.testing.assert_allclose(all_of_them.values, alone.values, atol=2e-3)

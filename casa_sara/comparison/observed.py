@@ -115,9 +115,12 @@ class Observed:
                              "from its own pixels: the other models should have its centre")
         freqs_hz, spectra = read_spectra(one.spectra)
         subbands = Subbands(freqs_hz, np.full(freqs_hz.size, 1 / freqs_hz.size), freqs_hz[0], self._data.freq_range_hz)
-        grid = ImageGrid(plane.shape, plane.cell_rad, gridder="standard", subbands=subbands)
+        return self._seen(ImageGrid(plane.shape, plane.cell_rad, subbands=subbands), subbands.stacked(spectra))
+
+    def _seen(self, grid, images):
+        """Return the visibilities of images that are stacked."""
         operator = sky_operator(self._data.uvw, grid, self._data.freq_hz, eps=IMAGE_EPS, nthreads=self._nthreads)
-        return operator.forward(subbands.stacked(spectra))
+        return operator.forward(images)
 
     def _operator(self, plane, what, spectralindex="", reference=None):
         key = plane.shape, plane.cell_rad, spectralindex

@@ -57,10 +57,15 @@ class ObservedMosaic(Observed):
 
         As of `Observed`, they are predicted from its own pixels where these have the common centre.
         """
+        if one.spectra:
+            return self._data.vis - self._of_spectra(one)
         image = one.model
         plane, pixels = (image.plane, image.pixels) if image.plane.is_aligned(self.plane) else (self.plane, model)
         grid = ImageGrid(plane.shape, plane.cell_rad, gridder="mosaic", spectralindex=spectral_index_of(one))
         if grid.spectralindex:
             grid = with_spectrum(grid, plane, image.plane)
-        return self._data.vis - predicted(np.asarray(pixels, np.float32), self._data, self._selection, grid,
-                                          self._grid.mosaic.profiles, eps=IMAGE_EPS, nthreads=self._nthreads)
+        return self._data.vis - self._seen(grid, np.asarray(pixels, np.float32))
+
+    def _seen(self, grid, images):
+        return predicted(images, self._data, self._selection, replace(grid, gridder="mosaic"),
+                         self._grid.mosaic.profiles, eps=IMAGE_EPS, nthreads=self._nthreads)

@@ -152,7 +152,7 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
         doubtful = _look_back(images, plane, solution, comm)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         result = solution.result(images, doubtful, forecast, plane.grid.subbands, comm)
-        comm.once(_write, request, plane, images, solution.reconstruction, record and record(result), child)
+        comm.once(_write, request, plane, images, solution, record and record(result), child)
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
@@ -276,8 +276,9 @@ def _look_back(images, plane, solution, comm):
     return doubtful
 
 
-def _write(request, plane, images, reconstruction, record, child):
+def _write(request, plane, images, solution, record, child):
     """Write the products, with the errors that the draws give."""
+    reconstruction = solution.reconstruction
     draws, jackknife = (reconstruction.draws, reconstruction.jackknife) if reconstruction else (None, None)
     weight = images.pixels.get("weight")
     pb = None if weight is None else np.sqrt(weight / weight.max())
@@ -286,7 +287,7 @@ def _write(request, plane, images, reconstruction, record, child):
         errors["draws"] = draws.arrays()
     if reconstruction and reconstruction.spectra is not None:
         beam = restored_beam(list(request.output.restoringbeam or ()), images.beam)
-        errors |= spectral_images(reconstruction, plane.grid, beam)
+        errors |= spectral_images(reconstruction, plane.grid, solution.part.data, beam)
     write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child)
 
 

@@ -92,7 +92,7 @@ def divided_by_band(block_of_sample, infos, data, subbands):
     return block_of_sample, divided
 
 
-def spectral_images(found, grid, beam):
+def spectral_images(found, grid, data, beam):
     """Return the model at the frequencies that were solved for, and the spectral index of it smoothed to a beam.
 
     Parameters
@@ -101,6 +101,8 @@ def spectral_images(found, grid, beam):
         With `spectra`.
     grid : casa_sara.options.ImageGrid
         With `subbands`.
+    data : Visibilities
+        The samples; of a mosaic the noise follows from their primary beams.
     beam : dict
         Of the restored image.
 
@@ -113,9 +115,26 @@ def spectral_images(found, grid, beam):
     *axes, angle = beam_numbers(beam)
     cell = tuple(size / ARCSEC for size in grid.cell_rad)
     seen = beam_pixels(axes, cell) * np.array([smooth(plane, axes, angle, cell) for plane in found.spectra])
-    index, error, known = spectral_index(seen, grid.subbands, found.noise_jy_per_beam)
+    noise = found.noise_jy_per_beam
+    if grid.is_mosaic:
+        noise = noise * _noise_of_sky(grid, data)
+    index, error, known = spectral_index(seen, grid.subbands, noise)
     return {"alpha": index, "alpha.error": error, "known": known, "subbands": found.spectra,
             "freqs_hz": grid.subbands.freqs_hz}
+
+
+def _noise_of_sky(grid, data):
+    """Return the noise of the sky at each frequency in units of that of the image of flat noise, float32 (T, nx, ny).
+
+    As that of a single pointing it is to be divided by the root of the share of the frequency. It is infinite where
+    nothing is modelled.
+    """
+    mosaic = grid.mosaic
+    seen = mosaic.sensitivity(mosaic.sums(data.beam, data.weight))
+    at_each = np.array([mosaic.power(mosaic.sums(data.beam, data.weight * np.square(factor)))
+                        for factor in grid.subbands.factors(data.freq_hz)])
+    at_each = np.sqrt(at_each / np.float32(data.weight.sum(dtype=float))) * (seen > 0)
+    return np.divide(seen.max(), at_each, out=np.full_like(at_each, np.inf), where=at_each > 0)
 
 
 def spectral_index(seen, subbands, noise):
@@ -127,7 +146,7 @@ def spectral_index(seen, subbands, noise):
         Brightness, Jy/beam.
     subbands : Subbands
         Their frequencies, and the shares of the data that they stand for.
-    noise : float
+    noise : float, or (T, nx, ny)
         Of an image of all data, Jy/beam; that of one frequency is this over the root of its share.
 
     Returns
@@ -138,9 +157,9 @@ def spectral_index(seen, subbands, noise):
         Where the brightness is positive, and the error at most `LARGEST_ERROR`.
     """
     place = np.log(subbands.freqs_hz / subbands.reference_hz)[:, None, None]
-    good = (seen > 0).all(axis=0)
+    good = ((seen > 0) & np.isfinite(noise)).all(axis=0)
     brightness = np.where(good, seen, 1.0)
-    weight = subbands.shares[:, None, None] * (brightness / noise) ** 2
+    weight = np.where(good, subbands.shares[:, None, None] * (brightness / noise) ** 2, 1.0)
     total = weight.sum(axis=0)
     offset = place - (weight * place).sum(axis=0) / total
     spread = (weight * offset**2).sum(axis=0)

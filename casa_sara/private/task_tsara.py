@@ -233,8 +233,10 @@ def _refuse_for_spectra(parameters):
         raise ValueError(f"nterms = {nterms}: should be from 1 to {MOST_TERMS}")
     if nterms == 1:
         return
-    for name, right, reason in (("gridder", "standard", "other operators are of flat, or of known spectra"),
-                                ("method", "tsara", "the paper's method has one image"),
+    if parameters["gridder"] == "wproject":
+        raise ValueError(f"gridder = 'wproject' with nterms = {nterms}: the w-term is modelled of flat, or of known "
+                         "spectra; should be 'standard' or 'mosaic'")
+    for name, right, reason in (("method", "tsara", "the paper's method has one image"),
                                 ("stokes", "I", "spectra are those of the brightness"),
                                 ("positivity", True, "the brightness is positive at all frequencies"),
                                 ("spectralindex", "", "either the index is known, or it is solved for"),

@@ -111,6 +111,8 @@ class FlatNoise:
         casa_sara.reconstruction.result.Reconstruction
         """
         largest = float(self.sensitivity.max())
-        sky = np.divide(found.model, self.sensitivity, out=np.zeros_like(found.model), where=self.sensitivity > 0)
-        return replace(found, model=sky, noise_jy_per_beam=found.noise_jy_per_beam / largest,
+        sky, spectra = (image if image is None else np.divide(
+            image, self.sensitivity, out=np.zeros_like(image), where=self.sensitivity > 0)
+            for image in (found.model, found.spectra))
+        return replace(found, model=sky, spectra=spectra, noise_jy_per_beam=found.noise_jy_per_beam / largest,
                        threshold=found.threshold / largest)

@@ -223,11 +223,13 @@ class Problem:
         -------
         float
         """
-        if self.subbands is not None:
-            fluxes = np.abs(image).reshape(self.subbands.n_terms, -1).sum(axis=1, dtype=float)
-            return self.unit_jy * float((np.abs(self.subbands.factors(self.subbands.band_hz)).T @ fluxes).max())
-        sky = image if self.sky_over_image is None else image * self.sky_over_image
-        return self.unit_jy * float(np.abs(sky).sum(dtype=float))
+        count = 1 if self.subbands is None else self.subbands.n_terms
+        sky = image.reshape(count, -1, image.shape[-1])
+        sky = sky if self.sky_over_image is None else sky * self.sky_over_image
+        if self.subbands is None:
+            return self.unit_jy * float(np.abs(sky).sum(dtype=float))
+        fluxes = np.abs(sky).sum(axis=(1, 2), dtype=float)
+        return self.unit_jy * float((np.abs(self.subbands.factors(self.subbands.band_hz)).T @ fluxes).max())
 
 
 def _averages(average, samples, finer, grid, options):

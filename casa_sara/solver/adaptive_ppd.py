@@ -343,12 +343,11 @@ class AdaptivePPD:
         sums = [*sums.tolist(), float(greatest)]
         change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
-        if self.planes.n_planes > 1:
+        if self.planes.n_planes > 1 or self.sky_over_image is not None:
             seen = self.planes.at_reference(self.model)
+            if self.sky_over_image is not None:
+                seen = np.multiply(seen, self.sky_over_image, out=self.planes.split(self.scratch_image)[0])
             self.model_flux, self.model_max = float(seen.sum(dtype=float)), float(seen.max())
-        if self.sky_over_image is not None:
-            sky = np.multiply(self.model, self.sky_over_image, out=self.scratch_image)
-            self.model_flux, self.model_max = float(sky.sum(dtype=float)), float(sky.max())
 
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.

@@ -90,7 +90,8 @@ def _asked(ppd, bounds, lobes):
     weights = ppd.precond * np.repeat(bounds.noise_weights.astype(ppd.precond.dtype), np.diff(ppd.offsets))
     image, vis = ppd.scratch_image, ppd.scratch_vis
     # what a pixel of 1 changes in its gradient, Σ U w/σ², and the variance of the gradient, Σ U² w/σ²
-    place = (0, 0) if ppd.sky_over_image is None else tuple(n // 2 for n in image.shape)  # one that is seen
+    place = (0, 0) if ppd.sky_over_image is None else tuple(
+        n // 2 for n in ppd.planes.split(image).shape[1:])  # one that is seen
     ppd.planes.set_pixel(image, place)
     ppd.measurement.forward(image, vis)
     power = np.abs(vis)

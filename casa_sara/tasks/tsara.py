@@ -188,7 +188,7 @@ class _tsara:
                 source of another spectrum is averaged over the band; in a wide band this leaves
                 errors around it that no model can fit (with a spectral index of -0.8 it loses 43 %
                 of its brightness from 1 to 2 GHz), and nterms > 1 solves for it. The frequency
-                dependence of the primary beam is not modelled.
+                dependence of the primary beam is modelled with gridder='mosaic' alone.
         'cube'  an image of each channel, on the spectral axis that tclean makes of the same
                 parameters. The channels are solved one after the other, each from its own data,
                 with its own blocks, bounds and beam; niter and the blocks are those of a channel.
@@ -221,11 +221,12 @@ class _tsara:
         percent. .model, .image and .residual are at reffreq; .alpha is the spectral index of the
         model smoothed to the beam of .psf, .alpha.error its error by the noise, both masked where
         that is above 0.3; .subbands is the model at the frequencies that were solved for. Blocks
-        are divided by frequency, too. Memory and time go with nterms. As in tclean the spectra are
-        those of the sky as seen by the antennas, whose primary beam becomes narrower with
-        frequency: beyond the middle of the field .alpha is steeper than that of the sky. Only with
-        gridder='standard', and not with spectralindex, report, savemodel, ndraws, jackknife,
-        parallel.
+        are divided by frequency, too. Memory and time go with nterms. With gridder='standard' the
+        spectra are, as in tclean, those of the sky as seen by the antennas, whose primary beam
+        becomes narrower with frequency: beyond the middle of the field .alpha is steeper than that
+        of the sky. With gridder='mosaic', for one pointing too, they are those of the sky: the
+        primary beams of every frequency are in the model. Not with gridder='wproject',
+        spectralindex, report, savemodel, ndraws, jackknife, parallel.
         Example: nterms=3
 
     nchan : int, default -1

@@ -18,6 +18,7 @@ from casa_sara.casa.images.image_plane import define_image_plane
 from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, is_of_earth, rotation_between
 from casa_sara.casa.ms.subtables import readable, texts
 from casa_sara.casa.runtime.tools import opened
+from casa_sara.options import Selection
 
 __all__ = ["PrimaryBeams", "Profiles", "primary_beams"]
 
@@ -242,10 +243,14 @@ def _of_casa(data, selection, grid, telescope, diameter, freq_hz):
     """The same of another telescope, from CASA's image of its beam at one frequency, around the centre of a field."""
     wavelength = SPEED_OF_LIGHT / freq_hz
     cell = TABLE_WIDTH * wavelength / max(diameter, 1.0) / TABLE_PIXELS
-    centre = data.fields[min(data.fields)]
+    (number, field), centre = min(data.fields.items(), key=lambda one: one[0])
+    # CASA averages the beams of all fields that are selected
+    chosen = selection.of(number) | dict(field=str(field))
+    selection = Selection((selection.vis[number],), **chosen, datacolumn=selection.datacolumn)
+    data = replace(data, phase_center=centre, ms_names=selection.vis, spws={0: data.spws[number]})
     around = replace(grid, shape=(TABLE_PIXELS, TABLE_PIXELS), cell_rad=(cell, cell), phasecenter="",
                      reffreq=f"{float(freq_hz)!r}Hz")
-    plane = define_image_plane(replace(data, phase_center=centre), selection, around, pblimit=FAINTEST)
+    plane = define_image_plane(data, selection, around, pblimit=FAINTEST)
     if plane.notes:
         raise ValueError(f"gridder = 'mosaic': CASA has no primary beam of the telescope '{telescope}': image with "
                          "gridder = 'standard'")
