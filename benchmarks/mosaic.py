@@ -204,7 +204,7 @@ def errors(folder, realisations=4, ndraws=20):
         here.mkdir(exist_ok=True)
         sky, sources = the_sky(scene)
         simulate_mosaic(here / "x.ms", POINTINGS, sources, dishes=(12.0,) * 14 + (7.0,) * 6, rounds=6, hours=5.0,
-                        noise=FAINT[scene][number // 2 % 2], spread=70.0, seed=number, fourier_sum=transform)
+                        noise=FAINT[scene][number // 2 % 2], spread=45.0, seed=number, fourier_sum=transform)
         root = str(here / "tsara")
         with quiet(here / "tsara.txt"):
             made = tsara(**common(str(here / "x.ms")) | dict(imagename=root, ndraws=ndraws, overwrite=True, nthreads=1))
