@@ -411,7 +411,6 @@ def test_model_column_is_the_sky_through_the_beams(folder, tmp_path, monkeypatch
 
 @pytest.mark.parametrize("parameters, message", [
     (dict(specmode="cube"), "specmode = 'cube' with gridder = 'mosaic'"),
-    (dict(parallel=True), "parallel = True with gridder = 'mosaic'"),
     (dict(usepointing=True), "usepointing = True: should be True or False out of False|usepointing = True"),
     (dict(gridder="standard"), "gridder = 'standard': 7 fields, up to 3[0-9.]* arcsec apart, would be imaged as one "
      "pointing: should be gridder = 'mosaic'"),

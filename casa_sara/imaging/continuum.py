@@ -203,12 +203,12 @@ def _read(request, ranks, scratch):
     data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks, scratch)
     data.notes.extend(check_pointings(data, grid))
     if grid.is_mosaic:
-        data, grid = with_beams(data, request.selection, grid)
+        data, grid = with_beams(data, request.selection, grid, comm)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
     if grid.is_mosaic:
         weights = imaging_weights(data, grid, request.weighting, comm)
-        plane = plane.of_mosaic(weight_image(data, grid, weights), output.pblimit)
+        plane = plane.of_mosaic(weight_image(data, grid, weights, comm), output.pblimit)
     dish = total_power(request.single_dish, data, plane, grid)
     data.notes.extend(plane.notes)
     if not plane.mask.any():

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casa_sara.operators._workers import Workers
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.runtime import jit
 
 __all__ = ["Beam", "Mosaic", "around", "beam_at", "mosaic_density"]
@@ -142,7 +143,7 @@ class Mosaic:
         -------
         float64 (number of beams,)
         """
-        return np.bincount(beam_of_sample, weight, len(self.beams))
+        return np.bincount(beam_of_sample, weight, len(self.beams)).astype(float)  # of no samples they are whole
 
     def power(self, weights: npt.ArrayLike) -> np.ndarray:
         """Return Σ_g W_g A_g²: the weight of the data at each place of the sky.
@@ -221,7 +222,8 @@ def around(uvw: np.ndarray, middle: tuple[float, float, float]) -> tuple[np.ndar
     return np.array([u - w * (l / n), v - w * (m / n)]), np.exp(2j * np.pi * (cycles - np.rint(cycles)))
 
 
-def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarray, mosaic: Mosaic) -> np.ndarray:
+def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarray, mosaic: Mosaic,
+                   comm: Serial = SERIAL) -> np.ndarray:
     """Return the sampling density of each sample of a mosaic, float32 (M,), in the unit of `weight`.
 
     It is the sum of the weights in the sample's uv cell, those of each beam times its overlap with that of the sample,
@@ -241,13 +243,15 @@ def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarr
         Of each sample.
     mosaic : Mosaic
         The beams.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
 
     Returns
     -------
     float32 (M,)
     """
     count = len(mosaic.beams)
-    weights = mosaic.sums(beam_of_sample, weight)
+    weights = comm.allreduce(mosaic.sums(beam_of_sample, weight))
     step = max(1, max(mosaic.shape) // COARSE)
     x, y = np.arange(0, mosaic.shape[0], step)[:, None], np.arange(0, mosaic.shape[1], step)[None, :]
     gains = np.array([beam.at(x, y, mosaic.cell_rad).ravel().astype(np.float32) for beam in mosaic.beams])
@@ -260,16 +264,18 @@ def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarr
     cells = [np.rint(side * cell * axis).astype(np.int64) for side, cell, axis in zip(sides, mosaic.cell_rad, uvw)]
     other = (cells[0] < 0) | ((cells[0] == 0) & (cells[1] < 0))
     row, column = (np.where(other, -cell, cell) for cell in cells)
-    column -= column.min()
-    place = row * (column.max() + 1) + column
-    place = np.unique(place, return_inverse=True)[1].ravel()
+    column += comm.largest(-int(column.min(initial=0)))
+    place = row * (comm.largest(int(column.max(initial=0))) + 1) + column
+    here, place = np.unique(place, return_inverse=True)
+    everywhere = np.unique(np.concatenate(comm.allgather(here)))
+    place = np.searchsorted(everywhere, here)[place.ravel()]
     density = np.zeros(uvw.shape[1])
     order = np.argsort(beam_of_sample, kind="stable")
     ends = np.cumsum(np.bincount(beam_of_sample, minlength=count))
     members = [order[start:end] for start, end in zip([0, *ends[:-1]], ends)]
     for h, samples in enumerate(members):
-        if samples.size:
-            summed = np.bincount(place[samples], weight[samples], place.max() + 1)
+        if weights[h]:
+            summed = comm.allreduce(np.bincount(place[samples], weight[samples], everywhere.size).astype(float))
             for g in np.flatnonzero(overlap[h] > 0):
                 density[members[g]] += overlap[h, g] * summed[place[members[g]]]
     return np.maximum(density, weight).astype(np.float32)

@@ -196,6 +196,10 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     """Tell the checkpoint, on rank 0, of what data the solution is: digests of all that it depends on."""
     data = samples.data
     gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=samples.density)
+    beams = None
+    if grid.mosaic is not None:
+        gathered["beam"] = np.asarray(data.beam)
+        beams = np.array([[*one.centre, one.radius_rad, *one.profile] for one in grid.mosaic.beams], np.float32)
     digests: dict[str, str | None] = {
         name: digest(whole) for name, array in gathered.items() if not data.scratch.on_disk
         and (whole := layout.gather(np.ascontiguousarray(array))) is not None}
@@ -205,7 +209,7 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     subbands = grid.subbands and grid.subbands.freqs_hz
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
         blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex, subbands=subbands,
-        sensitivity=grid.mosaic and grid.mosaic.over,
+        beams=beams,
         sdimage=samples.total_power and samples.total_power.values).items()}
     comm.once(checkpoint.identify, **digests)
 
