@@ -134,6 +134,7 @@ class SolverOptions:
     wavelets: tuple[str, ...] = SARA_BASES
     wavelevels: int = 4
     positivity: bool = True
+    polbound: bool = False
     precondition: bool = True
     databound: str = "adapt"
     boundtol: float = 1e-2

@@ -25,7 +25,7 @@ from casa_sara.casa.images.products import (
 from casa_sara.casa.images.restore import fit_beam, restore, restoring_beam_words
 from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.runtime import log
-from casa_sara.imaging.run_solver import _Preparing
+from casa_sara.imaging.run_solver import Preparing
 from casa_sara.options import ImageGrid, Output, Selection
 
 ARCSEC = np.pi / 180 / 3600
@@ -478,7 +478,7 @@ def test_progress_of_the_first_image():
     """A line in the log every 3 s, the live line at every iteration, and nothing once the solver iterates."""
     calls, clock = [], iter([0.0, 1.0, 3.5, 3.6, 4.0])
     progress = SimpleNamespace(prepare=lambda message, log: calls.append((message, log)))
-    preparing = _Preparing(progress, lambda: next(clock))
+    preparing = Preparing(progress, lambda: next(clock))
     for _ in range(3):
         preparing()
     preparing.over = True

@@ -1,4 +1,4 @@
-"""Stokes I visibilities of one image, and their split into snapshot blocks."""
+"""Visibilities of one image in Stokes I or others, and their split into snapshot blocks."""
 
 from __future__ import annotations
 
@@ -73,6 +73,8 @@ class Visibilities:
         Name of the telescope, of the first row selected.
     freq_hz : float32 (M,) or None
         LSRK frequencies, where they were asked for.
+    further_vis, further_weight : complex64 and float32 (S - 1, M), or None
+        The same of further Stokes parameters, where several were asked for: see :meth:`of_stokes`.
     beam : int32 (M,) or None
         Number of the primary beam of each sample, where they are modelled.
     fields : dict
@@ -100,6 +102,8 @@ class Visibilities:
     observatory: str = ""
     freq_hz: np.ndarray | None = None
     beam: np.ndarray | None = None
+    further_vis: np.ndarray | None = None
+    further_weight: np.ndarray | None = None
     fields: dict[tuple[int, int], dict] = field(default_factory=dict)
     mixed_weights: bool = False
     scratch: Scratch = IN_MEMORY
@@ -108,6 +112,29 @@ class Visibilities:
     def size(self) -> int:
         """Number of samples M."""
         return self.vis.size
+
+    @property
+    def n_stokes(self) -> int:
+        """Number of Stokes parameters S."""
+        return 1 if self.further_vis is None else 1 + len(self.further_vis)
+
+    def of_stokes(self, number: int) -> Visibilities:
+        """Return the samples of one of several Stokes parameters; all else is shared.
+
+        Parameters
+        ----------
+        number : int
+            0 for the first.
+
+        Returns
+        -------
+        Visibilities
+        """
+        alone = replace(self, further_vis=None, further_weight=None)
+        if number == 0:
+            return alone
+        assert self.further_vis is not None and self.further_weight is not None
+        return replace(alone, vis=self.further_vis[number - 1], weight=self.further_weight[number - 1])
 
     def take(self, index: np.ndarray) -> Visibilities:
         """Return the samples numbered `index`, in that order; `rows` stays whole.
@@ -127,7 +154,8 @@ class Visibilities:
 
     def _columns(self):
         """Return name → array of what there is of each sample."""
-        names = ("vis", "weight", "imaging_weight", "uvw", "row", "chan", "freq_hz", "beam")
+        names = ("vis", "weight", "imaging_weight", "uvw", "row", "chan", "freq_hz", "beam", "further_vis",
+                 "further_weight")
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
     def parts(self) -> Iterator[tuple[slice, Visibilities]]:

@@ -61,7 +61,7 @@ from casa_sara.reconstruction.total_power import TotalPower
 from casa_sara.runtime.deadline import Deadline
 
 __all__ = [
-    "Result", "Split", "after_iterations", "describe", "make_image", "split",
+    "Plane", "Result", "Split", "after_iterations", "caution", "describe", "make_image", "read_data", "split",
 ]
 
 MODEL_COLUMN = 3.0  # times as long as reading, to write it and read it back
@@ -138,7 +138,7 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
         comm.once(checkpoint.open)
     with waiting_child(write_images) if comm.rank == 0 else nullcontext() as child:  # it starts while CASA reads
         with kernels_loading(log.info):
-            data, plane = _read(request, ranks, scratch_of(output.imagename, forecast.workload))
+            data, plane = read_data(request, ranks, scratch_of(output.imagename, forecast.workload))
         if output.images_stand:
             return _complete(request, plane, data, forecast, comm)
         part = split(data, output.blocks, comm, plane.grid.subbands)
@@ -161,11 +161,11 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
 
 
 @dataclass(frozen=True)
-class _Plane:
+class Plane:
     """The plane of the image: `grid` is what was asked for, with the spectrum that belongs to the plane.
 
-    `startmodel` real (nx, ny) in Jy/pixel, `support` bool (nx, ny) and `dish`, what a single dish tells of the sky, are
-    None where there is none.
+    `startmodel` real (nx, ny) in Jy/pixel, or (S, nx, ny) of several Stokes parameters, `support` bool (nx, ny) and
+    `dish`, what a single dish tells of the sky, are None where there is none.
     """
 
     image_plane: ImagePlane
@@ -196,8 +196,24 @@ class _Solution:
                       images.model_flux, forecast.summary(), doubtful, subbands)
 
 
-def _read(request, ranks, scratch):
-    """Return this rank's visibilities, and the plane of the image with its first model and support."""
+def read_data(request, ranks, scratch):
+    """Return this rank's visibilities, and the plane of the image with its first model and support.
+
+    Parameters
+    ----------
+    request : ImagingRequest
+        What the task was asked for.
+    ranks : casa_sara.parallel.partition.RankAssignment
+        The ranks that read.
+    scratch : casa_sara.runtime.scratch.Scratch
+        Where the samples go.
+
+    Returns
+    -------
+    data : Visibilities
+    plane : Plane
+        Of several Stokes parameters that of the first, with the first models of all.
+    """
     grid, output, comm = request.grid, request.output, ranks.comm
     frequencies = grid.needs_frequencies
     data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks, scratch)
@@ -213,15 +229,24 @@ def _read(request, ranks, scratch):
     data.notes.extend(plane.notes)
     if not plane.mask.any():
         data.notes.append(nowhere_visible(grid, output))
-    _caution(data)
+    caution(data)
     grid = comm.once(with_spectrum, with_subbands(grid, data, plane), plane)
-    start = comm.once(read_model, output.startmodel, plane) if output.startmodel and not output.resume else None
+    start = comm.once(_startmodel, output, plane, grid.stokes)
     if output.images_stand:
-        return data, _Plane(plane, grid, start)
+        return data, Plane(plane, grid, start)
     support = comm.once(read_support, grid, plane)
     if support is not None and start is not None:
         start *= support
-    return data, _Plane(plane, grid, start, support, dish)
+    return data, Plane(plane, grid, start, support, dish)
+
+
+def _startmodel(output, plane, stokes):
+    """Return the first model, of each of several Stokes parameters; None where there is none."""
+    if not output.startmodel or output.resume:
+        return None
+    if len(stokes) == 1:
+        return read_model(output.startmodel, plane)
+    return np.array([read_model(output.startmodel, plane.of_stokes(stokes), number) for number in range(len(stokes))])
 
 
 def _complete(request, plane, data, forecast, comm):
@@ -266,13 +291,13 @@ def _look_back(images, plane, solution, comm):
     for line in named_suspects(part.blocks, doubtful):
         log.warn(line)
     if plane.dish is None:
-        _caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
+        caution(data, beyond_baselines(pixels["model"], plane.grid.cell_rad, -comm.largest(-data.min_uv)))
     if plane.support is not None:
         pixels["mask"] = check_confined(pixels["model"], plane.support)
         sigma = thermal_noise(data, images.weights, part.noise, part.offsets, comm)
         if "weight" in pixels:  # of flat noise
             sigma /= float(pixels["weight"].max()) ** 0.5
-        _caution(data, left_outside(pixels["residual"], plane.support, sigma))
+        caution(data, left_outside(pixels["residual"], plane.support, sigma))
     return doubtful
 
 
@@ -315,8 +340,16 @@ def split(data, blocks, comm=SERIAL, subbands=None):
     return Split(data, infos, offsets, noise)
 
 
-def _caution(data, notes=None):
-    """Warn of these notes, which the record keeps too, or of those that are there."""
+def caution(data, notes=None):
+    """Warn of these notes, which the record keeps too, or of those that are there.
+
+    Parameters
+    ----------
+    data : Visibilities
+        Whose notes are those of the record.
+    notes : list of str, optional
+        New ones.
+    """
     for note in data.notes if notes is None else notes:
         log.warn(note)
     data.notes.extend(notes or [])

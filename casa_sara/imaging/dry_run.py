@@ -80,8 +80,8 @@ def _may_be_on_disk(grid, options, limits, comm):
 
     The report has all of them in memory.
     """
-    return (comm.size == 1 and not grid.is_cube and not grid.is_mosaic and grid.nterms == 1 and not limits.report
-            and (options.averages or options.niter == 0))
+    return (comm.size == 1 and not grid.is_cube and not grid.is_mosaic and grid.nterms == 1 and len(grid.stokes) == 1
+            and not limits.report and (options.averages or options.niter == 0))
 
 
 def scratch_of(imagename, workload):
@@ -172,8 +172,9 @@ def dry_run(selection, grid, options, output, limits):
     block_of_sample, _ = divided_by_band(*divide(data, output.blocks), data, grid.subbands)
     data, offsets = sort_into_blocks(data, block_of_sample)
     timing = measure(data, offsets, grid, options, time.perf_counter() - start)
-    timing = replace(timing, channels=max(found.workload.channels, 1))
-    for line in _time_lines(timing):
+    several = "channels" if grid.is_cube else "Stokes parameters"
+    timing = replace(timing, channels=max(found.workload.channels, len(grid.stokes)))
+    for line in _time_lines(timing, several):
         log.info(line)
     seconds = {name: getattr(timing, name) for name in ("reading", "building", "pair", "nnls_iteration", "iteration",
                                                         "drawing", "writing", "total")}
@@ -182,9 +183,9 @@ def dry_run(selection, grid, options, output, limits):
                               "iteration_s": timing.iteration}
 
 
-def _time_lines(timing):
-    """The times as lines of a table."""
-    channels = f" for each of {timing.channels} channels" if timing.channels > 1 else ""
+def _time_lines(timing, several):
+    """The times as lines of a table; `several` is what there are several of."""
+    channels = f" for each of {timing.channels} {several}" if timing.channels > 1 else ""
     yield (f"forecast: {timing.total:.0f} s, with about {timing.iterations} iterations{channels} (the number depends "
            "on the data)" + (f", the visibilities averaged to {timing.averages}" if timing.averages else ""))
     rows = {"reading": timing.reading, "building the operator": timing.building,

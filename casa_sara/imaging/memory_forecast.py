@@ -20,6 +20,7 @@ __all__ = ["Forecast", "Workload", "forecast"]
 # bytes of one visibility; docs/reliability.md, "Forecast", has the measurement
 SAMPLE = 46  # Visibilities: vis, two weights, uvw, row, chan
 FREQUENCY = 4  # of a sample, where they are kept
+STOKES = 12  # of a sample, of each Stokes parameter beyond the first: vis and weight
 READING = 62  # chunks, and one column joined
 POINT = 28  # of the operator: NonUniformFFT's Points
 PLANNING = 64  # frequencies and factors, while the operator is built
@@ -83,6 +84,7 @@ class Workload:
     on_disk: bool = False  # and are kept on the disk
     blocks: int = 0  # asked for; 0 for those of the automatic rule
     nterms: int = 1  # images that are solved for together
+    stokes: int = 1  # Stokes parameters that are solved side by side
 
     @classmethod
     def of(cls, volume, grid, options, report=False, band=0.0, ranks=ALONE):
@@ -99,13 +101,22 @@ class Workload:
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2,
-                   averages=options.averages, nterms=grid.nterms)
+                   averages=options.averages, nterms=grid.nterms, stokes=len(grid.stokes))
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
         if self.on_disk and not self.channels:
             return self._on_disk()
+        if self.stokes > 1:
+            return self._of_stokes()
         return self._of_cube() if self.channels else self._of_plane()
+
+    def _of_stokes(self):
+        """The phases of several Stokes parameters, of which each has all that one alone has of its own."""
+        shared = ("libraries", "visibilities", "while reading", "uv grid", "while planning", "wavelet workspace")
+        further = {"further Stokes parameters": STOKES * (self.stokes - 1) * self.samples}
+        return {phase: {part: size * (1 if part in shared else self.stokes) for part, size in parts.items()} | further
+                for phase, parts in replace(self, stokes=1).memory().items()}
 
     def _of_cube(self):
         """The phases of the fullest channel, beside all data and the cubes; all is read and written at once."""

@@ -14,7 +14,7 @@ from casa_sara.operators.piecewise import operator_on_disk
 from casa_sara.operators.sky import sky_operator
 from casa_sara.parallel.serial import SERIAL
 
-__all__ = ["IMAGE_EPS", "PlaneImages", "plane_images", "point_spread"]
+__all__ = ["IMAGE_EPS", "PlaneImages", "plane_images", "point_spread", "residual_visibilities"]
 
 IMAGE_EPS = 1e-6  # accuracy of the PSF, residual images and the model column
 
@@ -70,7 +70,7 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     if grid.is_mosaic:
         operator = _operator(data, grid, options, comm)
     seen = model if grid.subbands is None else grid.subbands.stacked(model)
-    residual = dirty_image(operator, _residual(operator, data, grid, options, seen, comm), weights, comm)
+    residual = dirty_image(operator, residual_visibilities(operator, data, grid, options, seen, comm), weights, comm)
     pixels = dict(psf=psf, residual=residual, model=model)
     if grid.is_mosaic:
         pixels["weight"] = weight_image(data, grid, weights, comm)
@@ -82,10 +82,21 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     return PlaneImages(pixels, weights, comm.total(sumwt), beam)
 
 
-def _residual(operator, data, grid, options, model, comm):
+def residual_visibilities(operator, data, grid, options, model, comm):
     """Return the visibilities less those of a model; of samples on the disk what gives them piece by piece.
 
     These are predicted by the operator of the dirty images unless there are spectra.
+
+    Parameters
+    ----------
+    operator : object
+        Of the dirty images.
+    data, grid, options, model, comm
+        As of :func:`plane_images`.
+
+    Returns
+    -------
+    complex (M,) or callable
     """
     if data.scratch.on_disk and grid.spectrum is None:
         return lambda piece, operator: data.vis[piece] - operator.forward(model)

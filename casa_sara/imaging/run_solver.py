@@ -31,7 +31,8 @@ from casa_sara.solver.nnls import NNLS_ITERATIONS
 from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER, TIME_LIMIT, UNFINISHED
 from casa_sara.version import __version__
 
-__all__ = ["Watch", "at_odds", "checkpoint_of", "density_of", "expected_iterations", "solve_image", "without_wild"]
+__all__ = ["Preparing", "Watch", "at_odds", "checkpoint_of", "density_of", "expected_iterations", "log_end",
+           "reduced_chi2", "solve_image", "without_wild"]
 
 AT_ODDS, OF_BRIGHTEST = 3.0, 0.01  # times what a single dish alone leaves, and of its brightest point: a warning
 MOST_NAMED = 20  # wild samples that the log names one by one
@@ -117,7 +118,7 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     Reconstruction
     """
     progress = log.Progress()
-    preparing = _Preparing(progress)
+    preparing = Preparing(progress)
     report = partial(_report, progress, preparing, schedule_of(options).expected_iterations, watch.pace if watch
                      else None)
     with stop_on_interrupt() as pressed:
@@ -136,7 +137,7 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     record = reconstruction.record
     if record.stop_code == STOPPED_BY_USER and not ranks.comm.bcast(pressed()):
         record.stop_code = TIME_LIMIT
-    _log_end(reconstruction, samples.offsets, control.checkpoint, ranks.comm)
+    log_end(reconstruction, samples.offsets, control.checkpoint, ranks.comm)
     for draws, what in ((reconstruction.jackknife, "groups of the jackknife"), (reconstruction.draws, "draws")):
         if draws is not None:
             _log_draws(draws, what, control.checkpoint)
@@ -149,7 +150,7 @@ def expected_iterations(options: SolverOptions) -> int:
     return schedule_of(options).expected_iterations + draws * DRAW_ITERATIONS
 
 
-def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: Callable[[int], str] | None, ppd,
+def _report(progress: log.Progress, preparing: Preparing, expected: int, pace: Callable[[int], str] | None, ppd,
             record):
     """Show how far the solution is, after every iteration of `expected` ones."""
     preparing.over = True
@@ -157,18 +158,30 @@ def _report(progress: log.Progress, preparing: _Preparing, expected: int, pace: 
     if pace and (line := pace(ppd.iteration - begun)):
         log.info(line)
     fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-    progress(ppd.iteration, f"reduced chi-square {_reduced(record.residual_norm[-1], ppd.samples.sum()):.4g}, "
+    progress(ppd.iteration, f"reduced chi-square {reduced_chi2(record.residual_norm[-1], ppd.samples.sum()):.4g}, "
              f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
              f"{record.reweighting[-1]} re-weightings", fraction)
 
 
-def _log_end(reconstruction, offsets, checkpoint, comm):
-    """Write to the log why the solution ended and what it found."""
+def log_end(reconstruction, offsets, checkpoint=None, comm=SERIAL):
+    """Write to the log why the solution ended and what it found.
+
+    Parameters
+    ----------
+    reconstruction : Reconstruction
+        The solution.
+    offsets : int (d + 1,)
+        Block j is the slice offsets[j]:offsets[j + 1] of the samples given.
+    checkpoint : Checkpoint, optional
+        That a restart continues from.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
+    """
     record = reconstruction.record
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     samples = _samples_of_blocks(reconstruction, offsets, comm)
     say(f"{record.stop_description}, after {record.iteration[-1]} iterations and {record.reweighting[-1]} "
-        f"re-weightings: reduced chi-square {_reduced(record.residual_norm[-1], samples.sum()):.4g}, model flux "
+        f"re-weightings: reduced chi-square {reduced_chi2(record.residual_norm[-1], samples.sum()):.4g}, model flux "
         f"{record.model_flux[-1]:.5g} Jy")
     if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
         log.info(f"restart = True continues from '{checkpoint.path}'")
@@ -178,8 +191,8 @@ def _log_end(reconstruction, offsets, checkpoint, comm):
                  "between pixel centres")
     _log_total_power(reconstruction.total_power)
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
-        log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, reduced chi-square "
-                 f"{_reduced(norm, samples[j]):.4g}")
+        log.info(f"block {j}: noise found {reduced_chi2(bound, samples[j]) ** 0.5:#.3g} x MS weights, "
+                 f"reduced chi-square {reduced_chi2(norm, samples[j]):.4g}")
 
 
 def _log_total_power(found):
@@ -234,7 +247,7 @@ def _log_draws(draws, name, checkpoint):
                  + (f"; restart = True makes the others, from '{checkpoint.path}'" if stands else ""))
 
 
-class _Preparing:
+class Preparing:
     """The progress of the NNLS fit, which is asked after every iteration whether to stop.
 
     Attributes
@@ -260,8 +273,20 @@ class _Preparing:
         self._progress.prepare(f"NNLS iteration {self._iteration}", due)
 
 
-def _reduced(norm, samples):
-    """Return χ²/2M, the reduced chi-square of M complex samples, of the norm of their whitened residual."""
+def reduced_chi2(norm, samples):
+    """Return χ²/2M, the reduced chi-square of M complex samples, of the norm of their whitened residual.
+
+    Parameters
+    ----------
+    norm : float
+        Of the residual.
+    samples : int
+        M.
+
+    Returns
+    -------
+    float
+    """
     return float(norm) ** 2 / (2.0 * max(int(samples), 1))
 
 

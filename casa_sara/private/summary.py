@@ -8,11 +8,12 @@ import numpy as np
 
 from casa_sara.imaging.continuum import Result
 from casa_sara.imaging.cube import CubeResult
+from casa_sara.imaging.polarisation import PolarisedResult
 from casa_sara.options import SolverOptions
 from casa_sara.solver.record import ITERATION_LIMIT, STOP_DESCRIPTIONS
 from casa_sara.version import __version__
 
-__all__ = ["cube_summary", "summary"]
+__all__ = ["cube_summary", "polarised_summary", "summary"]
 
 WHY = {
     "threshold_jy_per_pixel": "kappa of the last iteration: starts at 0.15 of the mean brightness of the NNLS image, "
@@ -92,6 +93,51 @@ def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False)
         "channels": [_channel(channel, result.code_of(channel), options, full) for channel in result.channels],
     }
     return _outcome(options, ends, result.stop_code, minor, sara)
+
+
+def polarised_summary(result: PolarisedResult, options: SolverOptions, full: bool = False) -> dict[str, Any]:
+    """Return the outcome of a run that made several Stokes parameters.
+
+    Parameters
+    ----------
+    result : casa_sara.imaging.polarisation.PolarisedResult
+        The results of the run.
+    options : casa_sara.options.SolverOptions
+        Task parameters of the method.
+    full : bool
+        Add the history of every iteration.
+
+    Returns
+    -------
+    dict
+        As of :func:`summary`, of the Stokes parameter that took most iterations; `summaryminor` has all of them with
+        their stop codes, and `sara` a record of each.
+    """
+    ends = max((_ends(one) for one in result.planes.values()), key=lambda one: one[-1:])
+    minor = {number: _minor(one, result.code_of(stokes))
+             for number, (stokes, one) in enumerate(result.planes.items())}
+    sara = {
+        "version": __version__,
+        "method": options.method,
+        "visibilities": result.data.size,
+        "dropped": dict(result.data.dropped),
+        "notes": list(result.data.notes),
+        "nthreads": options.nthreads,
+        "forecast": dict(result.forecast),
+        "polbound": options.polbound,
+        "polarised_above_jy_per_pixel": result.polarised_above,
+        "stokes": [_stokes(stokes, one, sumwt, result.code_of(stokes), options, full)
+                   for (stokes, one), sumwt in zip(result.planes.items(), result.sumwt)],
+    }
+    return _outcome(options, ends, result.stop_code, {0: minor}, sara)
+
+
+def _stokes(stokes, result, sumwt, code, options, full):
+    """Return the record of one Stokes parameter."""
+    entry = {"stokes": stokes, "sumwt": sumwt, "model_flux_jy": result.model_flux, "stopcode": code,
+             "stopDescription": STOP_DESCRIPTIONS[code], "suspects": [dict(suspect) for suspect in result.suspects],
+             "blocks": [_block(result, j) for j in range(len(result.blocks))]}
+    return entry | _solution(result, options, full)
 
 
 def _outcome(options, ends, code, minor, sara):

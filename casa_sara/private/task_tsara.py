@@ -11,6 +11,7 @@ from typing import Any
 from casa_sara.analysis import folder
 from casa_sara.casa.images.products import (
     CHECKPOINT,
+    PRODUCTS,
     REPORT,
     check_imagename,
     existing_products,
@@ -28,6 +29,7 @@ from casa_sara.casa.runtime.quantities import hertz, radians, seconds
 from casa_sara.imaging.continuum import make_image
 from casa_sara.imaging.cube import make_cube
 from casa_sara.imaging.dry_run import dry_run
+from casa_sara.imaging.polarisation import make_polarised
 from casa_sara.options import (
     Comparing,
     ImageGrid,
@@ -41,7 +43,7 @@ from casa_sara.options import (
 )
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.private.launch import in_parallel
-from casa_sara.private.summary import cube_summary, summary
+from casa_sara.private.summary import cube_summary, polarised_summary, summary
 from casa_sara.runtime.machine import available_cores
 from casa_sara.version import __version__
 
@@ -57,6 +59,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     _refuse_for_mosaics(parameters)
     _check_single_dish(parameters)
     _refuse_for_spectra(parameters)
+    _refuse_for_several_stokes(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
 
@@ -80,7 +83,7 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     if parameters["dryrun"]:
         output = Output(parameters["imagename"], blocks=_blocks(parameters))
         return {"forecast": dry_run(selection, grid, options, output, limits)}
-    make, tell = (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
+    make, tell = _face_of(grid)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
         dish = SingleDish(parameters["sdimage"], parameters["sdpsf"], parameters["sdgain"])
@@ -93,10 +96,17 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     return comm.bcast(tell(result, options, parameters["fullsummary"]))
 
 
+def _face_of(grid):
+    """Return what makes such an image, and what tells of it."""
+    if len(grid.stokes) > 1:
+        return make_polarised, polarised_summary
+    return (make_cube, cube_summary) if grid.is_cube else (make_image, summary)
+
+
 def _prepare(parameters, selection, grid, stack):
     """Take the imagename for as long as the stack lasts, and return the options of the output."""
     more = 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"]) + parameters["jackknife"]
-    check_imagename(parameters["imagename"], grid.shape, more)
+    check_imagename(parameters["imagename"], grid.shape, len(grid.stokes) * (len(PRODUCTS) + more) - len(PRODUCTS))
     stack.enter_context(one_run_of(parameters["imagename"]))
     recover_products(parameters["imagename"])
     output = _output(parameters)
@@ -246,12 +256,33 @@ def _refuse_for_spectra(parameters):
             raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 
 
+def _refuse_for_several_stokes(parameters):
+    """Raise on parameters that images of several Stokes parameters do not have."""
+    stokes = parameters["stokes"]
+    if len(stokes) == 1:
+        return
+    for name, right, reason in (("specmode", "mfs", "they are continuum images"),
+                                ("gridder", ("standard", "wproject"), "mosaics are of one Stokes parameter"),
+                                ("method", "tsara", "the paper's method has one image"),
+                                ("parallel", False, "they take one process"),
+                                ("ndraws", 0, "errors by bootstrap are of one image"),
+                                ("jackknife", False, "errors by jackknife are of one image")):
+        allowed = right if isinstance(right, tuple) else (right,)
+        if parameters[name] not in allowed:
+            raise ValueError(f"{name} = {parameters[name]!r} with stokes = '{stokes}': {reason}; should be "
+                             f"{' or '.join(map(repr, allowed))}")
+    if "I" in stokes and parameters["polbound"] and not parameters["positivity"]:
+        raise ValueError(f"positivity = False with stokes = '{stokes}' and polbound = True: where |(Q, U, V)| is at "
+                         "most I, I is not negative; should be True, or polbound = False")
+
+
 def _check_stokes(parameters):
     """Raise on parameters that are not possible with Stokes Q, U and V."""
     stokes = parameters["stokes"]
     if stokes == "I":
         return
-    for name, right, reason in (("positivity", False, "the image may be negative"),
+    signed = (("positivity", False, "the image may be negative"),) if "I" not in stokes else ()
+    for name, right, reason in (*signed,
                                 ("savemodel", "none", "MODEL_DATA is written for Stokes I only"),
                                 ("report", False, "reports are made for Stokes I only")):
         if parameters[name] != right:

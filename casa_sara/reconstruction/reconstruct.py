@@ -20,15 +20,15 @@ from casa_sara.reconstruction.paper_method import PAPER
 from casa_sara.reconstruction.problem import Problem, Samples, averaging_cell
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import check_l2bound, operator_accuracy, schedule_of
-from casa_sara.reconstruction.solution import begin, begin_draws, resume
+from casa_sara.reconstruction.solution import Solution, begin, begin_draws, resume
 from casa_sara.reconstruction.state_file import digest, digest_on_disk
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.dabbech2018 import run_paper_algorithm_2
 from casa_sara.solver.islands import add_flux_errors
 from casa_sara.solver.record import CONVERGED, NOISE_ONLY, SolverRecord
-from casa_sara.solver.reweighting import run_algorithm_2
+from casa_sara.solver.reweighting import Steps, algorithm_2, stepped
 
-__all__ = ["Control", "reconstruct"]
+__all__ = ["Control", "reconstruct", "reconstruction_steps"]
 
 NOISE_ONLY_RELTOL = 0.1  # what little noise leaves need not settle
 ERRORS_OF_ISLANDS = dict(draws="bootstrap_error_jy", jackknife="jackknife_error_jy")
@@ -56,6 +56,8 @@ class Control:
         each, and after every one.
     then : callable, optional
         Called at the end with the iteration, its bounds and its record, all as the solution has left them.
+    begun : callable
+        Called with the `Solution` before its first iteration, or once it has been resumed.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
@@ -64,6 +66,7 @@ class Control:
     tell: Callable[[str], None] = lambda line: None
     drawn: Callable[[str, Draws], None] = lambda name, draws: None
     then: Callable[[AdaptivePPD, Any, SolverRecord], None] | None = None
+    begun: Callable[[Solution], None] = lambda solution: None
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -100,6 +103,24 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     CheckpointError
         The state that was read is not one of these data.
     """
+    found: Reconstruction = stepped(reconstruction_steps(samples, grid, options, startmodel, control, support, ranks))
+    return found
+
+
+def reconstruction_steps(samples: Samples, grid: ImageGrid, options: SolverOptions,
+                         startmodel: np.ndarray | None = None, control: Control = Control(),
+                         support: np.ndarray | None = None, ranks: RankAssignment = ALONE) -> Steps:
+    """Yield the iteration and its bounds before each of its steps, which are for the caller to take: `reconstruct`.
+
+    Parameters
+    ----------
+    samples, grid, options, startmodel, control, support, ranks
+        As of :func:`reconstruct`.
+
+    Returns
+    -------
+    Reconstruction
+    """
     comm, checkpoint = ranks.comm, control.checkpoint
     _check(options, samples, comm)
     flat = FlatNoise.of(samples.data, grid, comm)
@@ -118,11 +139,12 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
         solution = begin(samples, problem_of, options, startmodel, control.stopped, ranks)
         if control.stopped():
             control = replace(control, checkpoint=None)
+    control.begun(solution)
     sides = averaging_cell(grid)
     averaging = _averaging(solution, sides)
     control.tell(_averaging_words(solution.ppd, averaging, options, grid, sides))
     if solution.result is None:
-        _solve(solution, samples, averaging, options, control, layout, ranks)
+        yield from _solve(solution, samples, averaging, options, control, layout, ranks)
     for name, resampling in solution.resamplings.items():
         if not _draw(solution, name, resampling, control, layout, ranks):
             break
@@ -132,7 +154,7 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
 
 def _solve(solution, samples, averaging, options, control, layout, ranks):
     """Run the solution to its end, and make ready for what follows it."""
-    record = _iterate(solution, options, control, layout, ranks)
+    record = yield from _iterate(solution, options, control, layout, ranks)
     begin_draws(solution, record, options)
     goes_on = bool(solution.resamplings or control.then)
     solution.result = _result(solution, record, samples, averaging, ranks.comm, goes_on)
@@ -216,12 +238,14 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
 
 def _iterate(solution, options, control, layout, ranks):
     """Run Algorithm 2 to its end, keeping the state now and then; return the record."""
-    schedule = schedule_of(options)
+    schedule: Any = schedule_of(options)
     if solution.found.noise_only:
         schedule = replace(schedule, final_reltol=max(schedule.final_reltol, NOISE_ONLY_RELTOL))
-    run: Callable[..., SolverRecord] = run_paper_algorithm_2 if options.method == PAPER else run_algorithm_2
     keep = partial(_keep, solution, control.checkpoint, layout, ranks)
-    return run(solution.ppd, solution.bounds, schedule, control.progress, control.stopped, keep, solution.stage)
+    ppd, bounds, stage = solution.ppd, solution.bounds, solution.stage
+    if options.method == PAPER:
+        return run_paper_algorithm_2(ppd, bounds, schedule, control.progress, control.stopped, keep, stage)
+    return (yield from algorithm_2(ppd, bounds, schedule, control.progress, control.stopped, keep, stage))
 
 
 def _draw(solution, name, resampling, control, layout, ranks):

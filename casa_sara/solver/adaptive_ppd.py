@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -340,9 +340,7 @@ class AdaptivePPD:
                 sums += self.points.project(self.model, self.anchor, self.model_bar, points_before)
             self.comm.barrier()
             sums, greatest = np.maximum(sums, (0, 0, -np.inf)), self.model.max()
-        sums = [*sums.tolist(), float(greatest)]
-        change, norm, self.model_flux, self.model_max = self.comm.bcast_numbers(sums)
-        self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
+        self.account_for(self.comm.bcast_numbers([*sums.tolist(), float(greatest)]))
         if self.planes.n_planes > 1 or self.sky_over_image is not None:
             seen = self._seen() if self.comm.rank == 0 else np.zeros(1)  # the others wait before they change the model
             self.model_flux, self.model_max = self.comm.bcast_numbers([float(seen.sum(dtype=float)), float(seen.max())])
@@ -353,6 +351,36 @@ class AdaptivePPD:
         if self.sky_over_image is None:
             return seen
         return np.multiply(seen, self.sky_over_image, out=self.planes.split(self.scratch_image)[0])
+
+    def account_for(self, sums: Sequence[float]) -> None:
+        """Take σ, the flux and the largest pixel from sums over the model after a step.
+
+        Parameters
+        ----------
+        sums : float (4,)
+            Σ(x − x_prev)², Σx², Σx and max x.
+        """
+        change, norm, self.model_flux, self.model_max = sums
+        self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
+
+    def unprojected(self, out: np.ndarray) -> np.ndarray:
+        """Return z − τ(ηΦ†v + ζΨu), what Step 17 has projected: of the last step, in one process.
+
+        Parameters
+        ----------
+        out : real (nx, ny)
+            Receives the result.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
+        real = self.model.dtype.type
+        np.multiply(self._data_gradient, real(self.l2_step), out=out)
+        out += self._prior_gradient
+        out *= real(-self.tau)
+        out += self.anchor
+        return out
 
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,7 +24,10 @@ from casa_sara.solver.record import (
 )
 from casa_sara.solver.significance import SignificantSupport
 
-__all__ = ["Schedule", "Stage", "run_algorithm_2"]
+__all__ = ["Schedule", "Stage", "Steps", "algorithm_2", "run_algorithm_2", "stepped"]
+
+# asks for one step of the iteration that it yields, whose gradients are weighed by the bounds; returns its result
+Steps = Generator[tuple[AdaptivePPD, GivenBounds | AdaptiveBounds], None, Any]
 
 RISE = 1.05  # of the residual norm within one interval, from its least
 STEADY = 3e-3  # relative change of the residual norm within one interval
@@ -147,6 +150,46 @@ def run_algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, sche
           progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None,
           stopped: Callable[[], bool] = lambda: False, keep: Callable[[Stage, bool], None] = lambda stage, now: None,
           stage: Stage | None = None) -> SolverRecord:
+    """Do all of :func:`algorithm_2`, whose arguments these are.
+
+    Parameters
+    ----------
+    ppd, bounds, schedule, progress, stopped, keep, stage
+        As of :func:`algorithm_2`.
+
+    Returns
+    -------
+    SolverRecord
+    """
+    record: SolverRecord = stepped(algorithm_2(ppd, bounds, schedule, progress, stopped, keep, stage))
+    return record
+
+
+def stepped(steps: Steps) -> Any:
+    """Take the steps that are asked for, and return the result.
+
+    Parameters
+    ----------
+    steps : generator
+        As :func:`algorithm_2`.
+
+    Returns
+    -------
+    object
+        What the generator returns.
+    """
+    while True:
+        try:
+            ppd, _ = next(steps)
+        except StopIteration as end:
+            return end.value
+        ppd.step()
+
+
+def algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, schedule: Schedule = Schedule(),
+                progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None,
+                stopped: Callable[[], bool] = lambda: False,
+                keep: Callable[[Stage, bool], None] = lambda stage, now: None, stage: Stage | None = None) -> Steps:
     """Algorithm 2: solve, re-weight, and solve again until nothing changes.
 
     The weights start at W = ν, the noise of each band relative to that of a pixel (at least 1); those of re-weighting k
@@ -172,6 +215,11 @@ def run_algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, sche
     stage : Stage, optional
         Where to go on from, with `ppd` and `bounds` in the states that belong to it.
 
+    Yields
+    ------
+    ppd, bounds
+        Whenever the iteration is to do its next step: between two of these its state is that of whole iterations.
+
     Returns
     -------
     SolverRecord
@@ -181,7 +229,7 @@ def run_algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, sche
     while True:
         if stage.k >= schedule.nreweights and not stage.last:
             _begin_last(ppd, bounds, stage)
-        record.stop_code = _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep)
+        record.stop_code = yield from _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep)
         if stage.last or record.stop_code != CONVERGED:
             break
         if _renew_weights(ppd, bounds, schedule, stage):
@@ -217,7 +265,7 @@ def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
     """Algorithm 1 for one set of weights; return its stop code."""
     record = stage.record
     while True:
-        ppd.step()  # Steps 5–6 and 11–19
+        yield ppd, bounds  # Steps 5–6 and 11–19
         record.note(ppd, stage.k)
         if bounds.adapt(ppd):  # Steps 7–10
             record.bounds.append((ppd.iteration, bounds.l2_bounds.copy()))

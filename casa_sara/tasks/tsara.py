@@ -137,14 +137,20 @@ class _tsara:
         Examples: phasecenter='J2000 19h59m28.356 +40d44m02.10'
                   phasecenter=2
 
-    stokes : {'I', 'Q', 'U', 'V'}, default 'I'
-        One of I, Q, U and V. I is formed from RR and LL, from XX and YY, or from one of the two where
-        only one was recorded. With circular feeds, Q and U are formed from RL and LR, V from RR and
-        LL; with linear feeds, Q from XX and YY, U and V from XY and YX. Data that are stored as
-        Stokes parameters are used as they are; other correlations, and their order, do not matter. Q,
-        U and V may be negative and need positivity=False. As in tclean, a sample with any correlation
-        flagged is not used. Where the weight of one parallel-hand correlation is 0, negative or NaN,
-        I is taken from the other one alone.
+    stokes : {'I', 'Q', 'U', 'V', 'IQ', 'IV', 'QU', 'UV', 'IQU', 'QUV', 'IQUV'}, default 'I'
+        One of I, Q, U and V, or several: IQ, IV, QU, UV, IQU, QUV, IQUV. I is formed from RR and LL,
+        from XX and YY, or from one of the two where only one was recorded. With circular feeds, Q and
+        U are formed from RL and LR, V from RR and LL; with linear feeds, Q from XX and YY, U and V from
+        XY and YX. Data that are stored as Stokes parameters are used as they are; other correlations,
+        and their order, do not matter. Q, U and V may be negative: without I they need
+        positivity=False. As in tclean, a sample with any correlation flagged is not used. Where the
+        weight of one parallel-hand correlation is 0, negative or NaN, I alone is taken from the other
+        one; of several Stokes parameters such a sample is not used.
+        Several are read once and solved side by side, each with its own noise levels and weights of the
+        prior; they are the planes of each product, as tclean writes them. Not available for several:
+        specmode='cube', gridder='mosaic', method='dabbech2018', nterms, sdimage, ndraws, jackknife,
+        savemodel, report and parallel.
+        Examples: stokes='IQUV'
 
     projection : {'SIN'}, default 'SIN'
         Only SIN, the projection that a coplanar interferometer measures.
@@ -441,6 +447,11 @@ class _tsara:
         how many. False is for skies with negative parts, such as the decrement of the
         Sunyaev-Zeldovich effect; the model is then less constrained.
 
+    polbound : bool, default False
+        Only used where stokes has I and others. True allows no pixel of the models more polarised
+        intensity than total intensity, sqrt(Q^2 + U^2 + V^2) at most I; I, Q, U and V are then solved
+        for together.
+
     precondition : bool, default True
         True scales the steps of the solver by the density of the uv coverage (preconditioning), so
         that sparsely and densely sampled spatial frequencies converge at the same rate. It changes
@@ -680,10 +691,10 @@ class _tsara:
         mosweight=True, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True,
         restoringbeam=[], pbcor=False, method='tsara', niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
-        mask='', pbmask=0.0, positivity=True, precondition=True, databound='adapt', boundtol=0.01, boundrelchange=0.01,
-        boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618, reweighttol=0.01,
-        reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, ndraws=0, jackknife=False, blocks=0,
-        nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False,
+        mask='', pbmask=0.0, positivity=True, polbound=False, precondition=True, databound='adapt', boundtol=0.01,
+        boundrelchange=0.01, boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618,
+        reweighttol=0.01, reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, ndraws=0, jackknife=False,
+        blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False,
         overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""

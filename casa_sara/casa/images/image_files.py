@@ -18,14 +18,14 @@ __all__ = ["read_model", "read_spectra", "write_image"]
 
 
 def write_image(name, pixels, plane, unit="", beam=None, masked=False):
-    """Write an image of one channel or more with the axes right ascension, declination, Stokes and frequency.
+    """Write an image with the axes right ascension, declination, Stokes and frequency, of which one may be longer.
 
     Parameters
     ----------
     name : str
         Path of the image.
-    pixels : real (nx, ny) or (nchan, nx, ny)
-        The pixels, in `unit`.
+    pixels : real (nx, ny), or (n, nx, ny) of n channels or of n Stokes parameters
+        The pixels, in `unit`. One plane serves all Stokes parameters.
     plane : ImagePlane
         The image plane: coordinates, primary beam, mask.
     unit : str
@@ -38,35 +38,40 @@ def write_image(name, pixels, plane, unit="", beam=None, masked=False):
     import casatools
 
     nx, ny = pixels.shape[-2:]
-    planes = pixels.reshape(-1, nx, ny)
+    several = plane.n_stokes > 1
+    planes = np.broadcast_to(pixels, (plane.n_stokes, nx, ny)) if several else pixels.reshape(-1, nx, ny)
     ia = casatools.image()
-    ia.fromshape(name, [nx, ny, 1, len(planes)], csys=plane.csys, log=False)
+    ia.fromshape(name, [nx, ny, len(planes), 1] if several else [nx, ny, 1, len(planes)], csys=plane.csys, log=False)
     try:
-        for channel, rows in itertools.product(range(len(planes)), slabs(nx, ny)):
-            ia.putchunk(planes[channel, rows, :, None, None], blc=[rows.start, 0, 0, channel])
+        for number, rows in itertools.product(range(len(planes)), slabs(nx, ny)):
+            ia.putchunk(planes[number, rows, :, None, None],
+                        blc=[rows.start, 0, number, 0] if several else [rows.start, 0, 0, number])
         if masked:
             ia.calcmask("T", name="mask0")
-            ia.putregion(pixelmask=np.moveaxis(plane.mask.reshape(planes.shape), 0, -1)[:, :, None], usemask=False)
+            mask = np.moveaxis(np.broadcast_to(plane.mask, planes.shape), 0, -1)
+            ia.putregion(pixelmask=mask[..., None] if several else mask[:, :, None], usemask=False)
         if unit:
             ia.setbrightnessunit(unit)
         ia.setmiscinfo(plane.miscinfo)
     finally:
         ia.close()
     with opened("table", name, nomodify=False) as tb:
-        tb.putkeyword("imageinfo", plane.imageinfo | _beam_record(beam))
+        tb.putkeyword("imageinfo", plane.imageinfo | _beam_record(beam, plane.n_stokes))
     with opened("table", os.path.join(name, "logtable"), nomodify=False) as tb:
         tb.removerows(list(range(tb.nrows())))  # how the image was made of temporary files
 
 
-def _beam_record(beam):
+def _beam_record(beam, n_stokes):
     """Return the record of the beam, or beams, in the information of an image."""
+    if beam and n_stokes > 1:  # the same of all Stokes parameters
+        return {"perplanebeams": {"nChannels": 1, "nStokes": n_stokes} | {f"*{k}": beam for k in range(n_stokes)}}
     if not isinstance(beam, (list, tuple)):
         return {"restoringbeam": beam} if beam else {}
     beams = {f"*{channel}": one for channel, one in enumerate(beam)}
     return {"perplanebeams": {"nChannels": len(beam), "nStokes": 1} | beams}
 
 
-def read_model(name, plane, channel=0):
+def read_model(name, plane, number=0):
     """Return a model image on the pixels of `plane`, its flux kept.
 
     On another grid each pixel's flux is shared among the new pixels around its place; a pixel
@@ -79,8 +84,8 @@ def read_model(name, plane, channel=0):
         A CASA image or a FITS file in Jy/pixel, or a unit that can be converted to it.
     plane : ImagePlane
         The image plane: coordinates, primary beam, mask.
-    channel : int
-        Of the image; a model of one channel serves all of them.
+    number : int
+        Of the channel, or of the Stokes parameter of the plane; a model of one channel serves all of them.
 
     Returns
     -------
@@ -98,17 +103,20 @@ def read_model(name, plane, channel=0):
             shape, given, csys = tuple(ia.shape()), ia.brightnessunit(), ia.coordsys()
             check_sky_axes(name, "startmodel", csys)
             planes = int(np.prod(shape[2:]))
-            if len(shape) < 2 or planes not in (1, plane.channels) or planes != max(shape[2:], default=1):
+            stokes = list(csys.stokes()) if csys.findcoordinate("stokes")["return"] else []
+            wanted = list(plane.csys["stokes1"]["stokes"])
+            if stokes != wanted and (stokes or len(wanted) > 1):
+                raise ValueError(f"startmodel = '{name}' is of Stokes {', '.join(stokes) or 'I'}: should be of "
+                                 f"{', '.join(wanted)}")
+            if (len(shape) < 2 or planes not in ((1, plane.channels) if len(wanted) == 1 else (len(wanted),))
+                    or planes != max(shape[2:], default=1)):
                 right = f"one channel, or {plane.channels}" if plane.channels > 1 else "one channel"
-                raise ValueError(f"startmodel = '{name}' has the shape {shape}: it takes one Stokes, {right}")
-            number = channel if planes > 1 else 0
-            pixels = np.where(read_pixels(ia, True, number), read_pixels(ia, False, number), np.float32(0))
+                raise ValueError(f"startmodel = '{name}' has the shape {shape}: it takes "
+                                 f"{'one' if len(wanted) == 1 else len(wanted)} Stokes, {right}")
+            chosen = number if planes > 1 else 0
+            pixels = np.where(read_pixels(ia, True, chosen), read_pixels(ia, False, chosen), np.float32(0))
     except RuntimeError as error:
         raise ValueError(f"startmodel = '{name}' cannot be read as an image: {error}") from error
-    stokes = list(csys.stokes()) if csys.findcoordinate("stokes")["return"] else []
-    wanted = plane.csys["stokes1"]["stokes"]
-    if stokes and stokes != list(wanted):
-        raise ValueError(f"startmodel = '{name}' is of Stokes {', '.join(stokes)}: should be of {', '.join(wanted)}")
     unit, factor = unit_of(given, csys)
     if unit != "Jy/pixel":
         raise ValueError(f"startmodel = '{name}' is in '{given}': it takes 'Jy/pixel'{_conversion(name, unit)}")

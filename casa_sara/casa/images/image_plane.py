@@ -100,6 +100,30 @@ class ImagePlane:
         csys.setspectral(frequencies=casatools.quanta().quantity(list(freqs_hz), "Hz"))
         return csys.torecord()
 
+    def of_stokes(self, stokes):
+        """Return the same plane of one Stokes parameter or of several.
+
+        Parameters
+        ----------
+        stokes : str
+            As 'I', or 'IQUV'.
+
+        Returns
+        -------
+        ImagePlane
+        """
+        import casatools
+
+        csys = casatools.coordsys()
+        csys.fromrecord(self.csys)
+        csys.setstokes(list(stokes))
+        return replace(self, csys=csys.torecord())
+
+    @property
+    def n_stokes(self) -> int:
+        """Planes along the axis of Stokes parameters."""
+        return len(self.csys["stokes1"]["stokes"])
+
     @property
     def channels(self) -> int:
         """Planes along the spectral axis."""
@@ -120,7 +144,7 @@ def define_image_plane(visibilities, selection, grid, pblimit=PB_LIMIT, channels
     selection : casa_sara.options.Selection
         The MeasurementSets and the data selected in them.
     grid : casa_sara.options.ImageGrid
-        Size, pixels, direction and gridder of the image.
+        Size, pixels, direction and gridder of the image; its plane is that of the first Stokes parameter.
     pblimit : float
         |pblimit| is the lowest primary beam; where it is negative, only .pb and what is divided by it are masked.
     channels : int
@@ -295,7 +319,7 @@ def _image_record(visibilities, grid, root):
         "imsize": [int(n) for n in grid.shape],
         "cell": [f"{float(cell)!r}rad" for cell in grid.cell_rad],
         "phasecenter": f"{center['refer']} {longitude!r}rad {latitude!r}rad",
-        "stokes": grid.stokes,
+        "stokes": grid.stokes[0],
         "projection": grid.projection,
         "specmode": grid.specmode,
         "reffreq": grid.reffreq,

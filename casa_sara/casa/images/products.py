@@ -27,8 +27,8 @@ from casa_sara.runtime.atomic import new_files, recover_files, sync
 from casa_sara.version import __version__
 
 __all__ = [
-    "CHECKPOINT", "DRAWS", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines", "new_products",
-    "recover_products", "remove_products", "write_products",
+    "CHECKPOINT", "DRAWS", "PRODUCTS", "RECORD", "REPORT", "check_imagename", "existing_products", "history_lines",
+    "new_products", "recover_products", "remove_products", "write_products",
 ]
 
 PRODUCTS = (".psf", ".residual", ".model", ".image", ".sumwt", ".pb")
@@ -110,12 +110,12 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
         Its `imagename`, `restoringbeam` and `history`, lines for the history of every image.
     plane : ImagePlane
         The image plane: coordinates, primary beam, mask.
-    images : dict of float32 (nx, ny), or (nchan, nx, ny) of a cube
+    images : dict of float32 (nx, ny), or (n, nx, ny) of n channels or of n Stokes parameters
         'psf' and 'residual' of `weights.dirty_image` (the PSF is 1 at its centre, the
         residual in Jy/beam) and 'model' in Jy/pixel; 'mask', 'weight' of a mosaic, 'model.error', 'image.error' and
         'image.jackknife' where there are; 'draws' is a dict of arrays, kept as `DRAWS`. Of spectra, 'alpha' and
         'alpha.error', bool 'known' (nx, ny) where they are known, and 'subbands' (T, nx, ny) in Jy/pixel at 'freqs_hz'.
-    sumwt : float, or one for each channel
+    sumwt : float, or one for each channel or Stokes parameter
         Sum of the imaging weights.
     beam : dict
         Of `restore.fit_beam`, or a list with one for each channel.
@@ -132,6 +132,7 @@ def write_products(output, plane, images, sumwt, beam, record=None, child=None):
     images, draws = {name: image for name, image in images.items() if name != "draws"}, images.get("draws")
     more = 2 * output.pbcor + sum(max(np.size(image) // math.prod(plane.pb.shape), 1) for name, image in images.items()
                                   if name not in ("psf", "residual", "model"))
+    more += (plane.n_stokes - 1) * (len(PRODUCTS) + 2 * output.pbcor)
     check_imagename(output.imagename, plane.pb.shape, more)  # the disk may have filled up since the run began
     with new_products(output.imagename) as root:
         try:

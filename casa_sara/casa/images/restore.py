@@ -155,13 +155,16 @@ def write_corrected(root, plane, model):
         Name of the images without suffix.
     plane : ImagePlane
         The image plane: coordinates, primary beam, mask.
-    model : float32 (nx, ny) or (nchan, nx, ny), Jy/pixel
+    model : float32 (nx, ny), or (n, nx, ny) of n channels or of n Stokes parameters, Jy/pixel
         The model.
     """
     with opened("image", root + ".image") as ia:
-        image = np.array([read_pixels(ia, number=k) for k in range(plane.channels)]).reshape(plane.pb.shape)
+        image = np.array([read_pixels(ia, number=k) for k in range(plane.channels * plane.n_stokes)])
         beam = ia.restoringbeam()
-    if "beams" in beam:
+    image = image.reshape(model.shape)
+    if "beams" in beam and plane.n_stokes > 1:
+        beam = beam["beams"]["*0"]["*0"]
+    elif "beams" in beam:
         beam = [beam["beams"][f"*{k}"]["*0"] for k in range(plane.channels)]
     for name, pixels, unit, restored_with in ((".image", image, "Jy/beam", beam), (".model", model, "Jy/pixel", None)):
         corrected = np.divide(pixels, plane.pb, out=np.zeros_like(pixels), where=plane.mask)

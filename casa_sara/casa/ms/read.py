@@ -1,4 +1,4 @@
-"""Visibilities of one Stokes parameter out of MeasurementSets."""
+"""Visibilities of Stokes parameters out of MeasurementSets."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ROW_DTYPES = {"time": np.float64, "interval": np.float64, "ms": np.int16, "spw"
 
 
 def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, ranks=ALONE, scratch=IN_MEMORY):
-    """Read, select, flag, combine to a Stokes parameter and turn to one phase centre.
+    """Read, select, flag, combine to Stokes parameters and turn to one phase centre.
 
     V_I = (V_RR + V_LL)/2, or (V_XX + V_YY)/2, or the one parallel-hand correlation there is, and as tclean (of
     circular, or of linear feeds)
@@ -52,7 +52,8 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     flagged or an autocorrelation, and when data, weights or uvw cannot be used; what was left out is counted by the
     first reason that applies. Weights are, row by row, WEIGHT_SPECTRUM where it is filled, else WEIGHT, whatever the
     data column (as in tclean). Where one parallel-hand correlation has no weight (0, negative or NaN), Stokes I is the
-    other one, with its weight; tclean takes the mean of both there.
+    other one, with its weight; tclean takes the mean of both there. Of several Stokes parameters a sample has all, or
+    is left out.
 
     The inverse variance of Re V_I and of Im V_I follows from those of the correlations:
     Var(V_I) = (1/w_RR + 1/w_LL)/4, hence w = 4/(1/w_RR + 1/w_LL), when CASA's
@@ -69,7 +70,7 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     phasecenter : str or int
         Image centre, as in tclean; '' is that of the first selected field.
     stokes : str
-        'I', 'Q', 'U' or 'V'.
+        'I', 'Q', 'U' or 'V', or several of them, as 'IQUV'.
     frequencies : bool
         Keep the frequency of each sample.
     ranks : casa_sara.parallel.partition.RankAssignment
@@ -87,13 +88,14 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     ValueError, FileNotFoundError
         When there is nothing to image, or what was asked for is not in the data.
     """
-    if stokes not in STOKES:
-        raise ValueError(f"stokes = '{stokes}' cannot be imaged: should be one of {', '.join(STOKES)}")
+    if not stokes or not set(stokes) <= set(STOKES):
+        raise ValueError(f"stokes = '{stokes}' cannot be imaged: should be one of {', '.join(STOKES)}, or some of them")
     selected, notes = select_data(selection, stokes)
     image = image_direction(phasecenter, selected)
     _check_directions(phasecenter, image, selected)
     comm = ranks.comm
-    table, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, ranks), frequencies, scratch)
+    table, ranges = comm.together(_read_all, selected, image, _own_pieces(selected, ranks), frequencies, scratch,
+                                  len(stokes) - 1)
     ranges = np.concatenate(comm.allgather(ranges))
     data = table.usable_visibilities(comm)
     usable, size = table.usable, comm.total(data.size)
@@ -121,11 +123,11 @@ def read_visibilities(selection, phasecenter="", stokes="I", frequencies=False, 
     )
 
 
-def _read_all(selected, image, pieces, frequencies, scratch):
+def _read_all(selected, image, pieces, frequencies, scratch, further):
     """Return the table of the samples in these pieces, and the frequencies of each MeasurementSet."""
     most = sum(rows.size * group.channels.size for ms in selected for number, group in enumerate(ms.groups)
                for rows in pieces[ms.number, number])
-    table, ranges = _SampleTable(frequencies, scratch, most), []
+    table, ranges = _SampleTable(frequencies, scratch, most, further), []
     for ms in selected:
         geometry = Geometry(ms, image)
         with reading(ms.name), opened("table", ms.name) as tb:
@@ -222,15 +224,22 @@ def _read(part, rows, column, group):
 class _SampleTable:
     """The usable samples of all chunks so far."""
 
-    def __init__(self, frequencies, scratch, most):
+    def __init__(self, frequencies, scratch, most, further=0):
         self.usable, self._scratch = Usability(), scratch
         self._size = self._rows_so_far = 0
         self._alone = []
         size = most if scratch.on_disk else 0
-        self._samples = {name: [scratch.empty((3, size) if name == "uvw" else size, dtype)]
-                         for name, dtype in _SAMPLE_DTYPES.items()
-                         if frequencies or name != "freq_hz"}
+        shapes = dict.fromkeys(_SAMPLE_DTYPES, (size,)) | dict(uvw=(3, size))
+        shapes |= dict(further_vis=(further, size), further_weight=(further, size)) if further else {}
+        if not frequencies:
+            del shapes["freq_hz"]
+        self._samples = {name: [scratch.empty(shape, self._dtype(name))] for name, shape in shapes.items()}
         self._rows = {name: [np.empty(0, _ROW_DTYPES.get(name, np.int32))] for name in RowTable.__dataclass_fields__}
+
+    @staticmethod
+    def _dtype(name):
+        """Return the type of a column of the samples; those of further Stokes parameters are as of the first."""
+        return _SAMPLE_DTYPES[name.removeprefix("further_")]
 
     def add(self, chunk, ms, group, geometry):
         """Whiten, turn and append the usable samples of a chunk."""
@@ -238,12 +247,13 @@ class _SampleTable:
         columns = chunk.columns
         kept = ok.any(axis=1)
         uvw, shift = geometry.wavelengths(group, columns["field"], columns["time"], np.where(kept, chunk.uvw_m, 0.0))
-        vis, weight, alone = _formed(chunk, group, ok, weighted)
+        (vis, weight, alone), *further = [_formed(chunk, form, ok, weighted) for form in group.forms]
         self._alone += [(group.correlations[hand], self._size + np.flatnonzero(here))
                         for hand, here in zip(group.hands, alone) if here.any()]
         if shift is not None:
-            vis *= np.exp(-2j * np.pi * shift[ok])
-        hands = len(chunk.vis)
+            for one in (vis, *(one for one, *_ in further)):
+                one *= np.exp(-2j * np.pi * shift[ok])
+        hands = len(group.forms[0][0])
         number = self._rows_so_far + np.cumsum(kept) - 1
         channel = np.broadcast_to(group.channels, ok.shape)
         new = {
@@ -254,6 +264,9 @@ class _SampleTable:
             "row": np.repeat(number, ok.sum(axis=1)),
             "chan": channel[ok],
         }
+        if further:
+            new |= {"further_vis": np.array([one for one, *_ in further]),
+                    "further_weight": np.array([one for _, one, _ in further])}
         if "freq_hz" in self._samples:
             new["freq_hz"] = geometry.frequencies(group, columns["field"], columns["time"])[ok]
         self._append(new)
@@ -268,7 +281,7 @@ class _SampleTable:
         """Append samples: to a list of chunks, or to what is on the disk."""
         if not self._scratch.on_disk:
             for name, values in new.items():
-                self._samples[name].append(values.astype(_SAMPLE_DTYPES[name], copy=False))
+                self._samples[name].append(values.astype(self._dtype(name), copy=False))
             return
         for name, values in new.items():
             self._samples[name][0][..., self._size : self._size + values.shape[-1]] = values
@@ -285,12 +298,18 @@ class _SampleTable:
         data = Visibilities(**samples, rows=RowTable(**rows), scratch=self._scratch)
         ok = self.usable.compare(data, comm)
         self.usable.count_alone((name, np.count_nonzero(ok[index])) for name, index in self._alone)
+        data = data if ok.all() else data.part(np.flatnonzero(ok))
+        for number in range(1, data.n_stokes):
+            ok = self.usable.compare(data.of_stokes(number), comm)
+            data = data if ok.all() else data.part(np.flatnonzero(ok))
         self.usable.merge(comm)
-        return data if ok.all() else data.part(np.flatnonzero(ok))
+        return data
 
 
-def _formed(chunk, group, ok, weighted):
+def _formed(chunk, form, ok, weighted):
     """Return the Stokes parameter of the samples that are `ok`, its inverse variance, and where it is one correlation.
+
+    `form` is that of the RowGroup.
 
     Returns
     -------
@@ -298,12 +317,13 @@ def _formed(chunk, group, ok, weighted):
     alone : list of bool (M,)
         For each correlation, where it alone has a weight.
     """
-    vis, weight = ([hand[ok] for hand in hands] for hands in (chunk.vis, chunk.weight))
+    hands, sign, divisor = form
+    vis, weight = ([of_hands[hand][ok] for hand in hands] for of_hands in (chunk.vis, chunk.weight))
     if len(vis) == 1:
         return vis[0], weight[0], []
     with np.errstate(divide="ignore", invalid="ignore"):
-        formed, total = (vis[0] + group.sign * vis[1]) / group.divisor, 4 / (1 / weight[0] + 1 / weight[1])
-    alone = [~there[ok] for there in reversed(weighted)]
+        formed, total = (vis[0] + sign * vis[1]) / divisor, 4 / (1 / weight[0] + 1 / weight[1])
+    alone = [~weighted[hand][ok] for hand in reversed(hands)]
     for here, one, its_weight in zip(alone, vis, weight):
         formed[here], total[here] = one[here], its_weight[here]
     return formed, total, alone

@@ -46,8 +46,8 @@ class RowGroup:
     channels : int64 (C,), selected channel numbers, increasing
     freqs_hz, widths_hz : float64 (C,), centres and widths in `frame`
     frame : str, reference of the frequencies ('TOPO', 'LSRK', …)
-    hands : tuple of one or two int, the positions of the correlations that form the Stokes parameter; () without one
-    sign, divisor : it is (first + sign·second)/divisor
+    hands : tuple of int, the positions of the correlations that form the Stokes parameters; () without one
+    forms : for each Stokes parameter which one or two of the hands, sign and divisor of (first + sign·second)/divisor
     either : bool, whether one of the two will do where the other has no weight, as if the source were unpolarised
     weighing : tuple of int, the first correlation and the last: tclean's imaging weight is the mean of theirs
     correlations : tuple of str, all the correlations of the rows
@@ -64,8 +64,7 @@ class RowGroup:
     frame: str
     hands: tuple[int, ...]
     correlations: tuple[str, ...]
-    sign: int = 1
-    divisor: complex = 2
+    forms: tuple[tuple[tuple[int, ...], int, complex], ...] = ()
     either: bool = False
     weighing: tuple[int, ...] = ()
     dd: int = 0
@@ -116,7 +115,7 @@ def select_data(selection, stokes=""):
     selection : casa_sara.options.Selection
         The MeasurementSets and the data selected in them.
     stokes : str
-        'I', 'Q', 'U' or 'V', which must be in the data; '' where their correlations do not matter.
+        Of 'I', 'Q', 'U' and 'V' those that must be in the data; '' where their correlations do not matter.
 
     Returns
     -------
@@ -252,25 +251,28 @@ def _position(md, observation):
 
 
 def _formation(name, spw, codes, stokes, notes):
-    """Return how a Stokes parameter is formed of correlations `codes`: fields `hands` to `weighing` of a RowGroup."""
-    weighing = tuple(sorted({0, len(codes) - 1}))
-    alone = dict(hands=(), divisor=1, weighing=weighing)
+    """Return how Stokes parameters are formed of correlations `codes`: fields `hands` to `weighing` of a RowGroup."""
+    ways = [_formed_of(name, spw, codes, one, notes) for one in stokes]
+    hands = tuple(dict.fromkeys(hand for chosen, *_ in ways for hand in chosen))
+    forms = tuple((tuple(map(hands.index, chosen)), sign, divisor) for chosen, sign, divisor in ways)
+    return dict(hands=hands, forms=forms, either=stokes == "I" and len(hands) == 2,
+                weighing=tuple(sorted({0, len(codes) - 1})))
+
+
+def _formed_of(name, spw, codes, stokes, notes):
+    """Return the positions of the correlations that form one Stokes parameter, sign and divisor."""
     for number, code in enumerate(codes):  # the Stokes parameter itself
         if _STOKES_CODES.get(code) == stokes:
-            return alone | dict(hands=(number,))
-    for first, second, sign, divisor in _FORMED.get(stokes, ()):
+            return (number,), 1, 1
+    for first, second, sign, divisor in _FORMED[stokes]:
         if {first, second} <= set(codes):
-            return dict(hands=(codes.index(first), codes.index(second)), sign=sign, divisor=divisor,
-                        either=stokes == "I",
-                        weighing=weighing)
+            return (codes.index(first), codes.index(second)), sign, divisor
     parallel = [number for number, code in enumerate(codes) if code in _PARALLEL]
     if stokes == "I" and parallel:
         note = f"'{name}' has only {_STOKES_CODES[codes[parallel[0]]]}: {UNPOLARISED}"
         if note not in notes:
             notes.append(note)
-        return alone | dict(hands=(parallel[0],))
-    if not stokes:
-        return alone
+        return (parallel[0],), 1, 1
     names = ", ".join(_STOKES_CODES.get(code, f"type {code}") for code in codes)
     ways = ", or ".join(f"{_STOKES_CODES[first]} and {_STOKES_CODES[second]}" for first, second, *_ in _FORMED[stokes])
     raise ValueError(

@@ -207,7 +207,7 @@ def _weights_by_field(visibilities, grid, weighting, comm):
 
 
 def sum_of_weights(visibilities, weights, stokes="I"):
-    """tclean's `.sumwt`: each sample of Stokes I counts once for each parallel-hand correlation in its mean."""
+    """tclean's `.sumwt`: each sample of Stokes I alone counts once for each parallel-hand correlation in its mean."""
     if stokes != "I":
         return float(weights.sum(dtype=float))
     return sum(float(np.dot(weights[piece], part.rows.hands[part.row].astype(float)))

@@ -1,0 +1,204 @@
+"""Several Stokes parameters of one image: against tclean's images of them, and against images of each alone."""
+
+import json
+
+import numpy as np
+import pytest
+from fourier_sums import CELL, NOISE, OPTIONS, Sums, distance
+from simulated_ms import edit, simulate
+from test_polarisation import FEEDS, GRID, NOISE as OF_HANDS, SKY, polarise
+from test_visibilities import observation
+
+casatools = pytest.importorskip("casatools")
+
+from casa_sara import tsara
+from casa_sara.casa.images.image_plane import read_planes
+from casa_sara.casa.ms.read import read_visibilities
+from casa_sara.casa.runtime.tools import opened
+from casa_sara.data.visibilities import sort_into_blocks
+from casa_sara.options import ImageGrid, Selection, SolverOptions
+from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.polarised import StokesProblem, reconstruct_polarised
+from casa_sara.reconstruction.problem import Samples
+from casa_sara.reconstruction.reconstruct import Control, reconstruct
+from casa_sara.solver.record import STOPPED_BY_USER
+
+INNER = np.s_[:, 20:60, 18:54]
+SHORT = dict(niter=40, nreweights=1, **GRID)
+
+
+@pytest.fixture(scope="module")
+def observed(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ms")
+    return {feed: polarise(feed, simulate(folder / f"{feed}.ms", configuration="c", antennas=14, noise=OF_HANDS,
+                                          correlations=correlations, scans=2, integration=20.0, hour_angle=-2.0,
+                                          spacing_seconds=5400.0, spws=(("8.4GHz", "2MHz", 2),)))
+            for feed, correlations in FEEDS.items()}
+
+
+def planes(name):
+    """Return all planes of an image, and the record of their coordinates."""
+    with opened("image", name) as ia:
+        return read_planes(ia), ia.coordsys().torecord(), list(ia.shape())
+
+
+@pytest.mark.parametrize("feed, stokes", [
+    ("circular", "IQUV"), *(pytest.param(*one, marks=pytest.mark.slow)
+                            for one in (("linear", "IQUV"), ("circular", "QU"), ("linear", "IQ")))])
+def test_dirty_planes_are_tcleans(observed, feed, stokes):
+    import casatasks
+
+    common = dict(vis=observed[feed], stokes=stokes, niter=0, imsize=[80, 72], cell="1arcsec", datacolumn="data",
+                  weighting="briggs", robust=0.0)
+    tsara(imagename="ours", positivity="I" in stokes, restoration=False, **common)
+    casatasks.tclean(imagename="theirs", restoration=False, **common)
+    for suffix in (".residual", ".psf", ".pb", ".sumwt"):
+        (ours, csys, shape), (theirs, their_csys, their_shape) = planes("ours" + suffix), planes("theirs" + suffix)
+        assert shape == their_shape and shape[2:] == [len(stokes), 1]
+        for name in ("stokes", "crval", "cdelt", "crpix"):
+            np.testing.assert_array_equal(csys["stokes1"][name], their_csys["stokes1"][name])
+        if suffix in (".residual", ".psf"):
+            difference = np.sqrt(np.mean((ours[INNER] - theirs[INNER]) ** 2, axis=(1, 2)))
+            assert np.all(difference < 2e-3 * np.sqrt(np.mean(theirs[INNER] ** 2, axis=(1, 2))))
+    np.testing.assert_allclose(planes("ours.sumwt")[0], planes("theirs.sumwt")[0], rtol=1e-5)
+
+
+def test_all_stokes_are_read_as_each_alone(observed):
+    """Also of a sample of which one parallel hand has no weight: it has no V, and so it is not used."""
+    for name in observed.values():
+        data = read_visibilities(Selection((name,), datacolumn="data"), stokes="IQUV")
+        for number, stokes in enumerate("IQUV"):
+            one = read_visibilities(Selection((name,), datacolumn="data"), stokes=stokes)
+            own = data.of_stokes(number)
+            for array in ("vis", "weight", "imaging_weight", "uvw", "row", "chan"):
+                np.testing.assert_array_equal(getattr(own, array), getattr(one, array))
+    weights = []
+    edit(name, "WEIGHT", lambda weight: weights.append(weight.copy()) or np.where(
+        np.arange(weight.shape[1]) < 3, np.array([[0], [1], [1], [1]]) * weight, weight))
+    try:
+        few = read_visibilities(Selection((name,), datacolumn="data"), stokes="IQUV")
+    finally:
+        edit(name, "WEIGHT", lambda weight: weights[0])
+    assert few.size == data.size - 6 and few.dropped == {"non-positive weight": 6}
+
+
+@pytest.mark.slow
+def test_without_the_cone_each_is_what_it_is_alone(observed):
+    result = tsara(vis=observed["circular"], imagename="all", stokes="IQU", polbound=False, pbcor=True, **SHORT)
+    for number, stokes in enumerate("IQU"):
+        alone = tsara(vis=observed["circular"], imagename=stokes, stokes=stokes, positivity=stokes == "I", pbcor=True,
+                      **SHORT)
+        for suffix in (".model", ".residual", ".psf", ".image", ".pb", ".image.pbcor", ".model.pbcor"):
+            np.testing.assert_array_equal(planes("all" + suffix)[0][number], planes(stokes + suffix)[0][0])
+        entry = result["sara"]["stokes"][number]
+        assert entry["stokes"] == stokes and entry["chosen"] == alone["sara"]["chosen"]
+        assert entry["blocks"] == alone["sara"]["blocks"]
+        assert result["summaryminor"][0][0][number]["modelFlux"] == alone["summaryminor"][0][0][0]["modelFlux"]
+    assert result["sara"]["polarised_above_jy_per_pixel"] > 1e-6
+
+
+@pytest.mark.slow
+def test_no_pixel_is_polarised_beyond_its_brightness(observed):
+    given = dict(vis=observed["linear"], stokes="IQUV", polbound=True, mask="box[[10pix,10pix],[70pix,64pix]]") | GRID
+    result = tsara(imagename="x", **given)
+    model, *_ = planes("x.model")
+    polarised = np.sqrt(np.square(model[1:], dtype=float).sum(axis=0))
+    above = polarised > model[0] * (1 + 1e-6)
+    for x, y in ((48, 30), (28, 50)):  # around unresolved sources, where I may be negative, there is no cone
+        above[x - 2 : x + 3, y - 2 : y + 3] = False
+    assert not above.any() and polarised.max() > 0.25
+    assert not model[:, :10].any() and planes("x.mask")[2] == [80, 72, 4, 1]
+    assert 0 < result["sara"]["polarised_above_jy_per_pixel"] < 0.02 * model.max()
+    for number, stokes in enumerate("IQUV"):
+        for (x, y), flux in zip(((48, 30), (28, 50)), SKY[stokes]):
+            assert model[number, x - 4 : x + 5, y - 4 : y + 5].sum() == pytest.approx(flux, rel=0.05, abs=5e-3)
+    assert [island["right_ascension"][:8] for island in result["sara"]["stokes"][0]["islands"][:2]]
+    with open("x.sara.json") as record:
+        assert json.load(record)["stokes"][3]["stokes"] == "V"
+    # a restart goes on from the models of all
+    again = tsara(imagename="x", restart=True, niter=0, **given)
+    for entry, plane in zip(again["sara"]["stokes"], model):
+        assert entry["model_flux_jy"] == pytest.approx(plane.sum(dtype=float), rel=1e-5)
+
+
+@pytest.mark.parametrize("given, message", [
+    (dict(stokes="QU"), "positivity = True is not possible with stokes = 'QU'"),
+    (dict(positivity=False, polbound=True), "positivity = False with stokes = 'IQUV' and polbound = True"),
+    (dict(specmode="cube"), "specmode = 'cube' with stokes = 'IQUV': .*; should be 'mfs'"),
+    (dict(gridder="mosaic"), "gridder = 'mosaic' with stokes = 'IQUV': .*; should be 'standard' or 'wproject'"),
+    (dict(method="dabbech2018"), "method = 'dabbech2018' with stokes = 'IQUV'"),
+    (dict(nterms=2), "stokes = 'IQUV' with nterms = 2"),
+    (dict(parallel=True), "parallel = True with stokes = 'IQUV'"),
+    (dict(ndraws=5), "ndraws = 5 with stokes = 'IQUV'"),
+    (dict(jackknife=True), "jackknife = True with stokes = 'IQUV'"),
+    (dict(savemodel="modelcolumn"), "savemodel = 'modelcolumn' is not possible with stokes = 'IQUV'"),
+    (dict(report=True), "report = True is not possible with stokes = 'IQUV'"),
+    (dict(startmodel="i.model"), "startmodel = 'i.model' is of Stokes I: should be of I, Q, U, V")])
+def test_what_several_do_not_have_is_refused(observed, given, message):
+    if "startmodel" in given:
+        tsara(vis=observed["circular"], imagename="i", niter=0, **GRID)
+    with pytest.raises(ValueError, match=message):
+        tsara(vis=observed["circular"], imagename="x", **dict(stokes="IQUV") | given, **GRID)
+
+
+def test_a_dry_run_counts_all_of_them(observed):
+    one, four = (tsara(vis=observed["circular"], imagename="x", stokes=stokes, dryrun=True, **GRID)["forecast"]
+                 for stokes in ("I", "IQUV"))
+    part = "wavelet duals and weights"
+    assert four["memory_bytes"]["iterating"][part] == 4 * one["memory_bytes"]["iterating"][part]
+    assert four["memory_bytes"]["reading"]["further Stokes parameters"] == 36 * four["visibilities"]
+    assert four["seconds"]["total"] > 1.5 * one["seconds"]["total"]
+
+
+def _problems(stop_at=None):
+    """I, Q and U of two sources, one more polarised than bright, and noise."""
+    shape = (48, 48)
+    sums, problems, reached = Sums(shape), [], {}
+    for seed, (stokes, fluxes) in enumerate((("I", (30, 60)), ("Q", (10, -60)), ("U", (-8, 45)))):
+        data = observation([(0, 0, 0, 0, 60), (0, 0, 1, 1e4, 60)])
+        data, offsets = sort_into_blocks(data, data.rows.scan[data.row])
+        data.uvw[:] = sums.u / CELL, sums.v / CELL, 0 * sums.u
+        data.weight[:] = sums.weight
+        data.vis[:] = sums.of((fluxes[0] * NOISE, 30, 20, 0), (fluxes[1] * NOISE, 18, 30, 6)) + sums.noise(seed)
+        control = Control(lambda ppd, record, stokes=stokes: reached.__setitem__(stokes, ppd.iteration),
+                          lambda: stop_at in reached.values())
+        problems.append(StokesProblem(stokes, Samples(data, offsets, np.ones(data.size), np.ones(2)), None, control))
+    return problems, ImageGrid(shape, (CELL, CELL), stokes="IQU"), SolverOptions(**OPTIONS)
+
+
+@pytest.mark.slow
+def test_side_by_side_goes_on_from_a_checkpoint_as_if_never_stopped(tmp_path):
+    """Of Stokes parameters that are still going on, and of those that have come to their ends."""
+    def run(stop_at=None):
+        checkpoint = Checkpoint(str(tmp_path / "c"), "1", {})
+        if (tmp_path / "c").exists():
+            checkpoint.open()
+        problems, grid, options = _problems(stop_at)
+        return reconstruct_polarised(problems, grid, options, checkpoint=checkpoint)
+
+    problems, grid, options = _problems()
+    wanted = reconstruct_polarised(problems, grid, options)
+    ends = sorted(one.record.iteration[-1] for one in wanted.values())
+    assert run(25)["I"].record.stop_code == STOPPED_BY_USER
+    between = run((ends[0] + ends[1]) // 2)
+    assert [one.record.stop_code == STOPPED_BY_USER for one in between.values()].count(True) == 2
+    found = run()
+    for stokes, one in wanted.items():
+        np.testing.assert_array_equal(found[stokes].model, one.model)
+        np.testing.assert_array_equal(found[stokes].l2_bounds, one.l2_bounds)
+    model = {stokes: one.model.astype(float) for stokes, one in wanted.items()}
+    resolved = distance((48, 48), 30, 20) > 6  # around the other, a point, there is no cone
+    assert np.all((np.hypot(model["Q"], model["U"]) <= model["I"] * (1 + 1e-6))[resolved])
+
+
+def test_the_cone_lifts_what_is_too_faint_for_its_polarisation():
+    """A source whose Q and U together are brighter than the I that noise leaves; alone, each exceeds it."""
+    problems, grid, options = _problems()
+    together = reconstruct_polarised(problems, grid, options)
+    alone = {one.stokes: reconstruct(one.samples, grid, SolverOptions(**OPTIONS, positivity=one.stokes == "I"))
+             for one in problems}
+    area = np.s_[10:27, 22:39]
+    fluxes = [{stokes: float(one.model[area].sum()) for stokes, one in found.items()} for found in (together, alone)]
+    assert np.hypot(fluxes[1]["Q"], fluxes[1]["U"]) > fluxes[1]["I"]
+    assert np.hypot(fluxes[0]["Q"], fluxes[0]["U"]) <= fluxes[0]["I"] * (1 + 1e-5)
+    assert fluxes[0]["I"] > fluxes[1]["I"]
