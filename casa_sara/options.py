@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
-__all__ = ["LARGEST_INDEX", "Comparing", "ImageGrid", "Limits", "Output", "Selection", "SolverOptions", "Spectrum",
-           "SingleDish", "Weighting"]
+__all__ = ["LARGEST_INDEX", "Comparing", "ImageGrid", "Limits", "Outlier", "Output", "Selection", "SolverOptions",
+           "Spectrum", "SingleDish", "Weighting", "images_in", "stacked_shape"]
 
 LARGEST_INDEX = 5.0  # spectral index of any continuum, plus or minus
 
@@ -62,7 +64,8 @@ class ImageGrid:
     gridder='mosaic', a :class:`casa_sara.operators.beams.Mosaic`; `subbands` are the frequencies at which a sky of
     `nterms` > 1 is solved for, a :class:`casa_sara.operators.subbands.Subbands`, once the data are known. `start` and
     `width` of a cube's spectral axis are '', a channel number or a quantity; `nchan` is -1 where the data tell it.
-    `usemask`, `mask` and `pbmask` say where the model may be.
+    `usemask`, `mask` and `pbmask` say where the model may be. `outliers` are small images elsewhere, solved together
+    with this one.
     """
 
     shape: tuple[int, int]
@@ -89,6 +92,12 @@ class ImageGrid:
     usemask: str = "user"
     mask: tuple[str, ...] = ()
     pbmask: float = 0.0
+    outliers: tuple[Outlier, ...] = ()
+
+    @property
+    def shapes(self) -> tuple[tuple[int, int], ...]:
+        """Those of this image and of its outliers."""
+        return (self.shape, *(outlier.grid.shape for outlier in self.outliers))
 
     @property
     def is_cube(self) -> bool:
@@ -109,6 +118,53 @@ class ImageGrid:
     def masked(self) -> bool:
         """Whether the model is confined to a part of the image."""
         return self.usemask == "pb" or bool(self.mask)
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A small image beside the main one, with products under its own `imagename`.
+
+    `turn` is the matrix (3, 3) that takes (u, v, w) along the axes of the main image to those along its own, once the
+    data are known; `startmodel` is '' where there is none.
+    """
+
+    imagename: str
+    grid: ImageGrid
+    startmodel: str = ""
+    turn: Any = None
+
+
+def stacked_shape(shapes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Return the shape of an array that holds images of these shapes, one after the other along the first axis.
+
+    Parameters
+    ----------
+    shapes : sequence of (int, int)
+        Of the images.
+
+    Returns
+    -------
+    (int, int)
+    """
+    return sum(nx for nx, _ in shapes), max(ny for _, ny in shapes)
+
+
+def images_in(stacked: Any, shapes: Sequence[tuple[int, int]]) -> list[Any]:
+    """Return the images in an array of :func:`stacked_shape`, without copies.
+
+    Parameters
+    ----------
+    stacked : array
+        The images; what is beside the narrower ones belongs to none.
+    shapes : sequence of (int, int)
+        Of the images.
+
+    Returns
+    -------
+    list of arrays
+    """
+    ends = list(accumulate(nx for nx, _ in shapes))
+    return [stacked[end - nx : end, :ny] for end, (nx, ny) in zip(ends, shapes)]
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,9 @@ class DenseMeasurement:
 class DenseBand:
     slice: tuple
 
+    def of(self, coefs):
+        return coefs[self.slice]
+
 
 class DenseDictionary:
     """Pixels and Haar wavelets of one and two levels as one matrix Ψ† of (b·n, n), scaled to a Parseval frame."""

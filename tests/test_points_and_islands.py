@@ -151,7 +151,11 @@ def test_only_the_flux_of_points_is_free():
     free[points.x[0], points.y[0]] += 3 * points.shapes[0].astype(np.float32)
     free[points.x[2], points.y[2]] -= 3 * points.shapes[2].astype(np.float32)
     model, bar = free.copy(), 2 * free - anchor
-    change = points.project(model, anchor, bar, points.values(x))
+    apart = points.project(model.copy(), anchor, bar.copy(), points.values(x), [[0, 2], [1]])
+    change, = points.project(model, anchor, bar, points.values(x))
+    np.testing.assert_allclose(apart.sum(axis=0), change, rtol=1e-10)
+    second, = PointSources(points.places[1:2]).project(free.copy(), anchor, bar.copy(), points.values(x)[1:2])
+    np.testing.assert_allclose(apart[1], second, rtol=1e-10)
     at = points.pixels(x.shape)
     np.testing.assert_array_equal(model[~at], free[~at])
     np.testing.assert_allclose(bar, 2 * model - anchor, rtol=1e-6, atol=1e-6)

@@ -219,7 +219,7 @@ def test_what_all_frequencies_show_together():
     expected = (flat.conj().T @ flat[:, 10]).real.reshape(4, 4)
     np.testing.assert_allclose(point_response(ppd, bounds), expected, rtol=1e-10)
     assert PointSources([[0.5, 0.25]]).places.tolist() == [[0.5, 0.25]]
-    both = ppd.planes.points(PointSources([[0.5, 0.25]]), (8, 4))
+    both = ppd.planes.points([PointSources([[0.5, 0.25]])], (8, 4))
     assert both.places.tolist() == [[0.5, 0.25], [4.5, 0.25]]
     # nothing reaches from one image into the next: a bright last row of the first lowers no bound of the second
     ppd.model[3, 1] = 1.0

@@ -42,6 +42,10 @@ class Observed:
     """
 
     def __init__(self, selection, plane, request, sets, notes):
+        for one in sets:
+            if one.record.get("outliers"):
+                raise ValueError(f"models: '{one.name}' was imaged with an outlierfile, and residuals made from vis "
+                                 "would hold the outliers: leave vis out, and the residual images are compared")
         longitude, latitude = (float(angle) for angle in plane.centre)
         grid = ImageGrid(plane.shape, plane.cell_rad, f"{plane.frame} {longitude!r}rad {latitude!r}rad")
         with kernels_loading(log.info):

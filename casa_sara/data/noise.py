@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +20,8 @@ MOST_SAMPLES = 2_000_000  # of a block on the disk; of more, some baselines and 
 MEDIAN_TO_SIGMA = 1.482602218505602  # of |x| for a normal x
 
 
-def noise_from_differences(visibilities: Visibilities, offsets: np.ndarray, comm: Serial = SERIAL) -> np.ndarray:
+def noise_from_differences(visibilities: Visibilities, offsets: np.ndarray, comm: Serial = SERIAL,
+                           turns: Sequence[np.ndarray] = ()) -> np.ndarray:
     """Measure the noise of each block relative to the MS weights.
 
     Along one baseline and channel the sky changes slowly and the noise does not, so
@@ -33,6 +35,9 @@ def noise_from_differences(visibilities: Visibilities, offsets: np.ndarray, comm
     block fall into levels (:func:`casa_sara.data.weight_levels.levels`), as when most rows are bad and hardly weighed,
     it is measured in each: of levels of M_k samples the rms is √(Σ M_k·noise_k²/M), which a common median is not.
 
+    Sources far from the centre change faster. With a phase factor for each place where there are some, differences are
+    taken of these differences, turned to the first place, and so on: those of sources there vanish as well.
+
     Parameters
     ----------
     visibilities : Visibilities
@@ -41,6 +46,8 @@ def noise_from_differences(visibilities: Visibilities, offsets: np.ndarray, comm
         Block j is the slice offsets[j]:offsets[j + 1].
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread: each is sent all of some baselines for this.
+    turns : sequence of complex (M,)
+        exp(2πi(w_o − w)) of places far from the centre; of one rank alone.
 
     Returns
     -------
@@ -50,7 +57,8 @@ def noise_from_differences(visibilities: Visibilities, offsets: np.ndarray, comm
     """
     visibilities, offsets = by_baseline(visibilities, offsets, comm)
     series = series_of_rows(visibilities.rows)
-    return np.array([_block_noise(visibilities, slice(*ends), series, comm) for ends in zip(offsets[:-1], offsets[1:])])
+    return np.array([_block_noise(visibilities, slice(*ends), series, comm, turns)
+                     for ends in zip(offsets[:-1], offsets[1:])])
 
 
 def series_of_rows(rows: RowTable) -> np.ndarray:
@@ -71,7 +79,7 @@ def series_of_rows(rows: RowTable) -> np.ndarray:
     return key
 
 
-def _block_noise(visibilities, block, series, comm):
+def _block_noise(visibilities, block, series, comm, turns):
     """Return the noise of one block, or NaN."""
     if visibilities.scratch.on_disk:
         visibilities, block = _some_series(visibilities, block, series), slice(None)
@@ -91,7 +99,9 @@ def _block_noise(visibilities, block, series, comm):
     found: list[tuple[int, float]] = []  # samples and noise
     for number in reversed(range(count)):  # where differences are too few, the noise is that of the next heavier level
         here = level == number
-        noise = _noise_of_pairs(vis, variance, next_one & here[:-1] & here[1:], comm)
+        successive = next_one & here[:-1] & here[1:]
+        noise = _noise_of_turned(vis, variance, successive, [turn[block][order] for turn in turns]) if turns else \
+            _noise_of_pairs(vis, variance, successive, comm)
         found.append((comm.total(np.count_nonzero(here)), found[-1][1] if found and np.isnan(noise) else noise))
     sizes, noises = np.array(found).T
     return noises[0] if count == 1 else float(np.sqrt(np.average(np.square(noises), weights=sizes)))
@@ -122,3 +132,27 @@ def _noise_of_pairs(vis, variance, next_one, comm):
         return np.nan
     whitened = difference / np.sqrt(variance)
     return float(MEDIAN_TO_SIGMA * comm.median(np.abs([whitened.real, whitened.imag])))
+
+
+def _noise_of_turned(vis, variance, next_one, turns):
+    """Return the noise from differences that vanish for sources at the centre and where `turns` lead; NaN of too few.
+
+    Differences are second ones at each place, or, where there are too few of them, second ones at the centre, or first.
+    """
+    places = [np.ones_like(vis), *turns]
+    for orders in ([2] * len(places), [2] + [1] * len(turns), [1] * len(places)):
+        factors, series = np.ones((1, vis.size), complex), np.ones(vis.size, bool)
+        for place, order in zip(places, orders):
+            for _ in range(order):  # of the integrations from each one on, turned by their middle
+                middle = len(factors) // 2
+                turned = factors * place[middle : middle + factors.shape[1]].conj()
+                factors = np.pad(turned[:, :-1], ((0, 1), (0, 0))) - np.pad(turned[:, 1:], ((1, 0), (0, 0)))
+                series = series[:-1] & next_one[len(factors) - 2 :]
+        count = factors.shape[1]
+        if np.count_nonzero(series) >= FEWEST_DIFFERENCES:
+            terms = [slice(k, k + count) for k in range(len(factors))]
+            difference = sum(factor * vis[term] for factor, term in zip(factors, terms))[series]
+            power = sum(np.abs(factor) ** 2 * variance[term] for factor, term in zip(factors, terms))[series]
+            whitened = difference / np.sqrt(power)
+            return float(MEDIAN_TO_SIGMA * np.median(np.abs([whitened.real, whitened.imag])))
+    return np.nan

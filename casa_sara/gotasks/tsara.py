@@ -17,12 +17,12 @@ class _tsara(ShellTask):
         reffreq=None, spectralindex=None, nterms=None, nchan=None, start=None, width=None, outframe=None, veltype=None,
         restfreq=None, interpolation=None, perchanweightdensity=None, gridder=None, onepointing=None, wprojplanes=None,
         usepointing=None, mosweight=None, pblimit=None, weighting=None, robust=None, npixels=None, uvtaper=None,
-        restoration=None, restoringbeam=None, pbcor=None, method=None, niter=None, wavelets=None, wavelevels=None,
-        usemask=None, mask=None, pbmask=None, positivity=None, polbound=None, precondition=None, databound=None,
-        boundtol=None, boundrelchange=None, boundstep=None, boundinterval=None, l2bound=None, nreweights=None,
-        reweightdecay=None, reweighttol=None, reltol=None, finalreltol=None, regscale=None, significance=None,
-        ndraws=None, jackknife=None, blocks=None, nthreads=None, dryrun=None, maxmem=None, maxtime=None,
-        fullsummary=None, report=None, restart=None, overwrite=None, savemodel=None, parallel=None,
+        restoration=None, restoringbeam=None, pbcor=None, outlierfile=None, method=None, niter=None, wavelets=None,
+        wavelevels=None, usemask=None, mask=None, pbmask=None, positivity=None, polbound=None, precondition=None,
+        databound=None, boundtol=None, boundrelchange=None, boundstep=None, boundinterval=None, l2bound=None,
+        nreweights=None, reweightdecay=None, reweighttol=None, reltol=None, finalreltol=None, regscale=None,
+        significance=None, ndraws=None, jackknife=None, blocks=None, nthreads=None, dryrun=None, maxmem=None,
+        maxtime=None, fullsummary=None, report=None, restart=None, overwrite=None, savemodel=None, parallel=None,
     ):
         """Run the task, with the values in the shell where no argument is given."""
         given = dict(locals())

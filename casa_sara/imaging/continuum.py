@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
@@ -36,6 +36,17 @@ from casa_sara.imaging.dry_run import forecast_run, scratch_of
 from casa_sara.imaging.error_images import error_images
 from casa_sara.imaging.island_list import list_islands
 from casa_sara.imaging.mosaic import check_pointings, weight_image, with_beams
+from casa_sara.imaging.outliers import (
+    OutlierPlane,
+    OutlierResult,
+    joint_start,
+    joint_support,
+    outlier_images,
+    outlier_planes,
+    with_islands,
+    with_turns,
+    write_outliers,
+)
 from casa_sara.imaging.plane_images import plane_images, point_spread
 from casa_sara.imaging.predict_model import save_model
 from casa_sara.imaging.run_solver import (
@@ -49,9 +60,10 @@ from casa_sara.imaging.run_solver import (
 from casa_sara.imaging.spectra import divided_by_band, spectral_images, with_subbands
 from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
 from casa_sara.imaging.total_power import total_power
+from casa_sara.operators.outliers import rotation, stacked
 from casa_sara.operators.subbands import Subbands
 from casa_sara.operators.widefield import WTerm
-from casa_sara.options import ImageGrid, ImagingRequest
+from casa_sara.options import ImageGrid, ImagingRequest, images_in, stacked_shape
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.reconstruction.problem import Samples
@@ -74,8 +86,9 @@ class Result:
 
     `reconstruction` is None when only dirty images were asked for; `noise` is the noise of each block measured
     from the data, relative to the MS weights; `forecast` is the forecast of memory and time made before; `suspects`
-    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`; `subbands` are those of unknown spectra. With
-    several ranks, each has its own samples in `data`, and `size` is the number of all.
+    are the blocks of :func:`casa_sara.imaging.data_quality.suspects`; `subbands` are those of unknown spectra, and
+    `outliers` what was found in the images elsewhere. With several ranks, each has its own samples in `data`, and
+    `size` is the number of all.
     """
 
     data: Visibilities
@@ -88,6 +101,7 @@ class Result:
     forecast: dict
     suspects: list = field(default_factory=list)
     subbands: Subbands | None = None
+    outliers: list[OutlierResult] = field(default_factory=list)
 
     @property
     def finished(self) -> bool:
@@ -141,7 +155,7 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
             data, plane = read_data(request, ranks, scratch_of(output.imagename, forecast.workload))
         if output.images_stand:
             return _complete(request, plane, data, forecast, comm)
-        part = split(data, output.blocks, comm, plane.grid.subbands)
+        part = split(data, output.blocks, comm, plane.grid.subbands, plane.grid.outliers)
         del data  # the same samples, not yet sorted
         _check(request, plane, part, comm)
         watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
@@ -149,14 +163,17 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
         images = plane_images(solution.part.data, solution.seen, plane.grid, request.weighting, request.options,
                               plane.image_plane, comm)
         images.pixels["model"] = solution.model
+        others = outlier_images(plane.outliers, solution, images, request.options)
         doubtful = _look_back(images, plane, solution, comm)
         forecast = replace(forecast, iteration_s=watch.pace.seconds)
         result = solution.result(images, doubtful, forecast, plane.grid.subbands, comm)
+        result.outliers = others
+        write_outliers(output, plane.outliers, others)
         comm.once(_write, request, plane, images, solution, record and record(result), child)
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
-        comm.once(save_model, request.selection, solution.part.data, plane.grid, request.options, solution.model)
+        comm.once(save_model, request.selection, solution.part.data, plane.grid, request.options, solution.stacked)
     return result
 
 
@@ -165,7 +182,8 @@ class Plane:
     """The plane of the image: `grid` is what was asked for, with the spectrum that belongs to the plane.
 
     `startmodel` real (nx, ny) in Jy/pixel, or (S, nx, ny) of several Stokes parameters, `support` bool (nx, ny) and
-    `dish`, what a single dish tells of the sky, are None where there is none.
+    `dish`, what a single dish tells of the sky, are None where there is none; the first is of the image and its
+    `outliers` together, stacked, where there are some.
     """
 
     image_plane: ImagePlane
@@ -173,21 +191,37 @@ class Plane:
     startmodel: np.ndarray | None
     support: np.ndarray | None = None
     dish: TotalPower | None = None
+    outliers: tuple[OutlierPlane, ...] = ()
+
+    @property
+    def stacked_support(self):
+        """The support of the image and its outliers together."""
+        return joint_support(self.support, self.grid, self.outliers)
 
 
 @dataclass(frozen=True)
 class _Solution:
-    """A model and the samples that it was made of; without `reconstruction` it is the one to start from."""
+    """A model and the samples that it was made of; without `reconstruction` it is the one to start from.
+
+    `outliers` are the models of the outliers, and `islands` of each what was found in it.
+    """
 
     model: np.ndarray
     part: Split
     reconstruction: Reconstruction | None = None
+    outliers: Sequence[np.ndarray] = ()
+    islands: Sequence[list] = ()
+
+    @property
+    def stacked(self):
+        """The model, in one array with those of the outliers."""
+        return stacked([self.model, *self.outliers]) if self.outliers else self.model
 
     @property
     def seen(self):
-        """The model, at all frequencies that were solved for where these are several."""
+        """The same, at all frequencies that were solved for where these are several."""
         spectra = self.reconstruction and self.reconstruction.spectra
-        return self.model if spectra is None else spectra
+        return self.stacked if spectra is None else spectra
 
     def result(self, images, doubtful, forecast, subbands, comm):
         """Return what the task tells of it."""
@@ -222,6 +256,8 @@ def read_data(request, ranks, scratch):
         data, grid = with_beams(data, request.selection, grid, comm)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
+    grid = with_turns(grid, data)
+    outliers = outlier_planes(request, data, grid)
     if grid.is_mosaic:
         weights = imaging_weights(data, grid, request.weighting, comm)
         plane = plane.of_mosaic(weight_image(data, grid, weights, comm), output.pblimit)
@@ -231,13 +267,13 @@ def read_data(request, ranks, scratch):
         data.notes.append(nowhere_visible(grid, output))
     caution(data)
     grid = comm.once(with_spectrum, with_subbands(grid, data, plane), plane)
-    start = comm.once(_startmodel, output, plane, grid.stokes)
+    start = joint_start(comm.once(_startmodel, output, plane, grid.stokes), grid, outliers)
     if output.images_stand:
         return data, Plane(plane, grid, start)
-    support = comm.once(read_support, grid, plane)
-    if support is not None and start is not None:
-        start *= support
-    return data, Plane(plane, grid, start, support, dish)
+    found = Plane(plane, grid, start, comm.once(read_support, grid, plane), dish, outliers)
+    if found.stacked_support is not None and start is not None:
+        start *= found.stacked_support
+    return data, found
 
 
 def _startmodel(output, plane, stokes):
@@ -272,15 +308,19 @@ def _solve(request, plane, part, watch, ranks):
     """Find the model, within the time that writing leaves, and leave out the samples that it left out."""
     options, grid, comm, data = request.options, plane.grid, ranks.comm, part.data
     if options.niter == 0:
-        return _Solution(np.zeros(grid.shape, np.float32) if plane.startmodel is None else plane.startmodel, part)
+        start = np.zeros(stacked_shape(grid.shapes), np.float32) if plane.startmodel is None else plane.startmodel
+        main, *others = map(np.ascontiguousarray, images_in(start, grid.shapes))
+        return _Solution(main, part, outliers=others, islands=[[]] * len(others))
     watch.deadline.reserve = after_iterations(comm.total(data.size), grid.shape, request.output, request.limits,
                                               watch.deadline.elapsed()) + error_seconds(options, grid.shape)
     samples = Samples(data, part.offsets, density_of(data, request.selection, grid, options, comm), part.noise,
                       total_power=plane.dish)
-    found = solve_image(samples, grid, options, plane.startmodel, watch, plane.support, ranks)
+    found = solve_image(samples, grid, options, plane.startmodel, watch, plane.stacked_support, ranks)
+    islands = with_islands(found.record, plane.outliers, options.significance)
     list_islands(found.record, plane.image_plane, grid.cell_rad, options.significance, comm)
     used, blocks = without_wild(data, part.blocks, part.offsets, found, comm)
-    return _Solution(found.model, Split(used, blocks, np.searchsorted(found.kept, part.offsets), part.noise), found)
+    return _Solution(found.model, Split(used, blocks, np.searchsorted(found.kept, part.offsets), part.noise), found,
+                     found.outliers, islands)
 
 
 def _look_back(images, plane, solution, comm):
@@ -316,7 +356,7 @@ def _write(request, plane, images, solution, record, child):
     write_products(request.output, plane.image_plane, images.pixels | errors, images.sumwt, images.beam, record, child)
 
 
-def split(data, blocks, comm=SERIAL, subbands=None):
+def split(data, blocks, comm=SERIAL, subbands=None, outliers=()):
     """Sort the samples of a plane into snapshot blocks (`blocks` as of :class:`casa_sara.options.Output`).
 
     Parameters
@@ -329,6 +369,8 @@ def split(data, blocks, comm=SERIAL, subbands=None):
         Over whose ranks the samples are spread.
     subbands : Subbands, optional
         Parts of the band that have blocks of their own.
+    outliers : sequence of Outlier
+        What they hold is no noise either.
 
     Returns
     -------
@@ -336,7 +378,7 @@ def split(data, blocks, comm=SERIAL, subbands=None):
     """
     block_of_sample, infos = divided_by_band(*divide(data, blocks, comm), data, subbands)
     data, offsets = sort_into_blocks(data, block_of_sample, len(infos))
-    noise = noise_from_differences(data, offsets, comm)
+    noise = noise_from_differences(data, offsets, comm, [rotation(data.uvw, outlier) for outlier in outliers])
     return Split(data, infos, offsets, noise)
 
 

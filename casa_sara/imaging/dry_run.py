@@ -21,6 +21,7 @@ from casa_sara.data.visibilities import sort_into_blocks
 from casa_sara.imaging.load_balance import assign_ranks
 from casa_sara.imaging.memory_forecast import Workload, forecast
 from casa_sara.imaging.mosaic import check_pointings, with_beams
+from casa_sara.imaging.outliers import with_turns
 from casa_sara.imaging.spectra import divided_by_band, with_subbands
 from casa_sara.imaging.time_forecast import measure
 from casa_sara.operators.measurement import check_field
@@ -80,8 +81,8 @@ def _may_be_on_disk(grid, options, limits, comm):
 
     The report has all of them in memory.
     """
-    return (comm.size == 1 and not grid.is_cube and not grid.is_mosaic and grid.nterms == 1 and len(grid.stokes) == 1
-            and not limits.report and (options.averages or options.niter == 0))
+    return (comm.size == 1 and not (grid.is_cube or grid.is_mosaic or grid.outliers or limits.report)
+            and grid.nterms == 1 and len(grid.stokes) == 1 and (options.averages or options.niter == 0))
 
 
 def scratch_of(imagename, workload):
@@ -164,6 +165,7 @@ def dry_run(selection, grid, options, output, limits):
         data, grid = with_beams(data, selection, grid)
     if grid.spectralindex:
         grid = with_spectrum(grid, define_image_plane(data, selection, grid))
+    grid = with_turns(grid, data)
     if grid.nterms > 1:
         grid = with_subbands(grid, data, define_image_plane(data, selection, grid))
     everything = data.size

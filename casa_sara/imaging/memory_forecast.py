@@ -10,6 +10,7 @@ from casa_sara.data.blocks import SNAPSHOT_SAMPLES
 from casa_sara.operators.dictionary import coefficient_bytes
 from casa_sara.operators.measurement import grid_bytes
 from casa_sara.operators.sky import further_bytes
+from casa_sara.options import stacked_shape
 from casa_sara.parallel.partition import ALONE
 from casa_sara.reconstruction.bootstrap import MOST_GROUPS
 from casa_sara.reconstruction.problem import MOST_DOUBLINGS
@@ -44,6 +45,7 @@ MATCHED = 13  # of the matched filters, while the support is found
 DRAW, DRAWN_PART = 1.5, 0.3  # of a draw of the bootstrap, and the part of the image where a confined model may be
 ERRORS = 10  # images of errors, and of the smoothing
 MIXED, INDEXED = 2, 8  # of each image where several frequencies are solved for; of their smoothed ones
+TURNED = 8  # bytes of a sample of each outlier: its rotation, and once what an image contributes
 CONTRIBUTED = 8  # bytes of a sample, of each of these
 CUBES = 3  # psf, residual and model of each channel
 MASK = 1.25  # of each channel of a cube, as it is used and as it is written
@@ -84,6 +86,7 @@ class Workload:
     on_disk: bool = False  # and are kept on the disk
     blocks: int = 0  # asked for; 0 for those of the automatic rule
     nterms: int = 1  # images that are solved for together
+    outliers: tuple[tuple[int, int], ...] = ()  # shapes of small images beside this one
     stokes: int = 1  # Stokes parameters that are solved side by side
 
     @classmethod
@@ -96,12 +99,12 @@ class Workload:
         return cls(math.ceil(volume.samples * ranks.share), volume.reach, grid.shape, grid.cell_rad,
                    len(ranks.wavelets(options.wavelets)), options.wavelevels, options.niter, options.nthreads,
                    options.precondition, report and writes, grid.gridder, volume.max_w,
-                   grid.needs_frequencies, band, masked=grid.masked,
+                   grid.needs_frequencies, band, masked=grid.masked or bool(grid.outliers),
                    whole=(volume.samples, bases) if writes and ranks.comm.size > 1 else (0, 0),
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2,
-                   averages=options.averages, nterms=grid.nterms, stokes=len(grid.stokes))
+                   averages=options.averages, nterms=grid.nterms, stokes=len(grid.stokes), outliers=grid.shapes[1:])
 
     def memory(self):
         """Return phase → part → bytes, in addition to what the process holds before it reads."""
@@ -171,7 +174,8 @@ class Workload:
 
     def _solving(self, held, with_operator):
         """The phases from the density of the samples to the writing of a checkpoint."""
-        coefs, workspace = coefficient_bytes(self.shape, self.n_bases, self.levels)
+        coefs, workspace = map(sum, zip(*(coefficient_bytes(shape, self.n_bases, self.levels)
+                                          for shape in (self.shape, *self.outliers))))
         with_solver = with_operator | self._solver()
         iterating = with_solver | {
             "image planes": self._planes(PLANE + SOLVING * self.nterms + MATCHED * self.confined + self._mixing()),
@@ -201,7 +205,7 @@ class Workload:
         most = math.ceil(WORTHWHILE * self.samples)
         of_each = AVERAGED + PARTS * (self.gridder == "mosaic")
         return {"solver's visibilities": of_each * self.samples + AVERAGE * most + self._grid()
-                + further_bytes(most, self, self.max_w, self.band) + self._spectra(most)}
+                + further_bytes(most, self, self.max_w, self.band) + self._spectra(most) + self._elsewhere(most)}
 
     def _writing(self, with_operator):
         planes = PLANE + WRITING + ERRORS * bool(self.draws) + self._smoothing()
@@ -220,10 +224,15 @@ class Workload:
     def _operator(self, band=0.0):
         """Bytes of the measurement operator; `band` of an image of spectral indices, 0 for flat spectra."""
         further = further_bytes(self.samples, self, self.max_w, band) + self._spectra(self.samples)
-        return POINT * self.samples + self._grid() + further
+        return POINT * self.samples + self._grid() + further + self._elsewhere(self.samples)
+
+    def _elsewhere(self, samples):
+        """Bytes of the operators of outliers, which share the grid of the main image."""
+        return ((POINT + TURNED) * len(self.outliers) + TURNED * bool(self.outliers)) * samples + sum(
+            further_bytes(samples, replace(self, shape=shape), self.max_w) for shape in self.outliers)
 
     def _planes(self, count):
-        return int(4 * (count + SUPPORT * self.masked) * math.prod(self.shape))
+        return int(4 * (count + SUPPORT * self.masked) * math.prod(stacked_shape((self.shape, *self.outliers))))
 
     def _mixing(self):
         """Image planes in which images of several frequencies become orders of the spectra."""
@@ -294,21 +303,23 @@ class Forecast:
         """The memory as lines of a table, for the log."""
         work, parts = self.workload, self.phases[self.peak_phase]
         yield (f"forecast: {(self.resident + self.needed) / 1e9:.2f} GB of memory at the peak (phase: "
-               f"{self.peak_phase}) for {work.shape[0]} x {work.shape[1]} pixels{self._channels()} and {work.samples} "
+               f"{self.peak_phase}) for {work.shape[0]} x {work.shape[1]} pixels{self._more()} and {work.samples} "
                f"visibilities; {self.resident / 1e9:.2f} GB are in use now, and {self.room / 1e9:.2f} GB more are "
                "available:")
         for part, size in parts.items():
             yield f"  {part:<26}{size / 1e6:10.1f} MB"
         yield f"  {'total':<26}{self.needed / 1e6:10.1f} MB"
 
-    def _channels(self):
-        return f" in {self.workload.channels} channels" if self.workload.channels else ""
+    def _more(self):
+        outliers = f" and {len(self.workload.outliers)} outliers" if self.workload.outliers else ""
+        return outliers + (f" in {self.workload.channels} channels" if self.workload.channels else "")
 
     def summary(self):
         """Return what the returned dictionary says of it: sizes in bytes."""
         return {
             "imsize": list(self.workload.shape),
             **({"nchan": self.workload.channels} if self.workload.channels else {}),
+            **({"outliers": [list(shape) for shape in self.workload.outliers]} if self.workload.outliers else {}),
             "visibilities": self.workload.samples,
             "peak_bytes": self.resident + self.needed,
             "held_before_bytes": self.resident,
@@ -327,7 +338,7 @@ class Forecast:
         least = self.resident + self.needed
         limit = f"maxmem = {maxmem_gb:g} GB" if maxmem_gb else "the memory available"
         raise MemoryError(
-            f"imsize = {list(self.workload.shape)}{self._channels()} with the {self.workload.samples} visibilities of "
+            f"imsize = {list(self.workload.shape)}{self._more()} with the {self.workload.samples} visibilities of "
             f"vis takes {least / 1e9:.2f} GB while {self.peak_phase} ({parts}, in use now {self.resident / 1e9:.2f}); "
             f"{limit} allows {(self.resident + self.room) / 1e9:.2f} GB. {self._what_fits()}")
 

@@ -23,13 +23,14 @@ IMAGE_EPS = 1e-6  # accuracy of the PSF, residual images and the model column
 class PlaneImages:
     """The images of one plane: `pixels` are 'psf', 'residual', 'model' and, of a mosaic, 'weight', float32 (nx, ny).
 
-    `weights` (M,) made them.
+    `weights` (M,) made them, of the visibilities that the model has left, complex (M,), where there are outliers.
     """
 
     pixels: dict[str, np.ndarray]
     weights: np.ndarray
     sumwt: float
     beam: dict
+    left: np.ndarray | None = None
 
     @property
     def residual_peak(self) -> float:
@@ -50,7 +51,8 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     data : Visibilities
         The samples.
     model : real (nx, ny)
-        Jy/pixel; (T, nx, ny) at the frequencies of `grid.subbands`, where there are some and the model differs there.
+        Jy/pixel; (T, nx, ny) at the frequencies of `grid.subbands`, where there are some and the model differs there;
+        stacked with those of the outliers, where there are some. The images are those of the main one.
     grid : ImageGrid
         Size, pixels, direction and gridder of the image.
     weighting : Weighting
@@ -70,7 +72,8 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     if grid.is_mosaic:
         operator = _operator(data, grid, options, comm)
     seen = model if grid.subbands is None else grid.subbands.stacked(model)
-    residual = dirty_image(operator, residual_visibilities(operator, data, grid, options, seen, comm), weights, comm)
+    left = residual_visibilities(operator, data, grid, options, seen, comm)
+    residual = dirty_image(operator, left, weights, comm)
     pixels = dict(psf=psf, residual=residual, model=model)
     if grid.is_mosaic:
         pixels["weight"] = weight_image(data, grid, weights, comm)
@@ -79,13 +82,13 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
         sumwt = float(weights.sum(dtype=float))
     else:
         sumwt = sum_of_weights(data, weights, grid.stokes)
-    return PlaneImages(pixels, weights, comm.total(sumwt), beam)
+    return PlaneImages(pixels, weights, comm.total(sumwt), beam, left if grid.outliers else None)
 
 
 def residual_visibilities(operator, data, grid, options, model, comm):
     """Return the visibilities less those of a model; of samples on the disk what gives them piece by piece.
 
-    These are predicted by the operator of the dirty images unless there are spectra.
+    These are predicted by the operator of the dirty images unless there are spectra, or outliers.
 
     Parameters
     ----------
@@ -100,7 +103,7 @@ def residual_visibilities(operator, data, grid, options, model, comm):
     """
     if data.scratch.on_disk and grid.spectrum is None:
         return lambda piece, operator: data.vis[piece] - operator.forward(model)
-    if grid.spectrum is not None or grid.subbands is not None:
+    if grid.spectrum is not None or grid.subbands is not None or grid.outliers:
         operator = _sky_operator(data, grid, options, comm, data.freq_hz)
     if data.scratch.on_disk:
         predicted = operator.forward_pieces(model)
@@ -127,7 +130,7 @@ def point_spread(data, grid, weighting, options, plane, comm):
     The PSF of a mosaic is that of all samples without their primary beams.
     """
     weights = imaging_weights(data, grid, weighting, comm)
-    single = replace(grid, gridder="standard", mosaic=None) if grid.is_mosaic else grid
+    single = replace(grid, gridder="standard", mosaic=None) if grid.is_mosaic else replace(grid, outliers=())
     operator = _operator(data, single, options, comm)
     ones = _ones if data.scratch.on_disk else np.ones(data.size, np.complex64)
     psf = dirty_image(operator, ones, weights, comm)

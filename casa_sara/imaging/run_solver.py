@@ -61,7 +61,13 @@ def checkpoint_of(request: ImagingRequest) -> Checkpoint:
     parameters = asdict(request.selection) | asdict(request.grid) | asdict(request.options)
     parameters |= dict(blocks=output.blocks, startmodel=startmodel)
     parameters["imsize"], parameters["cell"] = parameters.pop("shape"), parameters.pop("cell_rad")
-    for name in ("vis", "nthreads", "spectrum", "mosaic", "subbands"):
+    if request.grid.outliers:
+        parameters["outlierfile"] = [
+            dict(imsize=one.grid.shape, cell=one.grid.cell_rad, phasecenter=one.grid.phasecenter,
+                 usemask=one.grid.usemask, mask=one.grid.mask, pbmask=one.grid.pbmask,
+                 startmodel=one.startmodel if one.startmodel != one.imagename + ".model" else "")
+            for one in request.grid.outliers]
+    for name in ("vis", "nthreads", "spectrum", "mosaic", "subbands", "outliers"):
         del parameters[name]
     return Checkpoint(output.imagename + CHECKPOINT, __version__, parameters, log.info, log.warn)
 
@@ -105,7 +111,7 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     options : SolverOptions
         Task parameters of the method.
     startmodel : float32 (nx, ny), optional
-        First model, Jy/pixel.
+        First model, Jy/pixel; it and `support` are stacked where there are outliers.
     watch : Watch, optional
         Without it there is no limit of time and no checkpoint.
     support : bool (nx, ny), optional

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from casa_sara.data.noise import noise_from_differences
-from casa_sara.operators.dictionary import SaraDictionary
-from casa_sara.operators.subbands import SubbandDictionary
+from casa_sara.operators.outliers import rotation
 from casa_sara.reconstruction.bootstrap import DRAW_ITERATIONS, DRAW_REWEIGHTINGS, MOST_GROUPS
 from casa_sara.reconstruction.paper_method import PAPER, paper_prior
 from casa_sara.reconstruction.problem import Problem, Samples
@@ -104,7 +103,8 @@ def measure(data, offsets, grid, options, reading):
     if not options.niter:
         return Timing(reading, 0.0, 0.0, 0.0, 0.0, writing, 0, 0)
     start = time.perf_counter()
-    eps = operator_accuracy(data, offsets, noise_from_differences(data, offsets))
+    turns = [rotation(data.uvw, outlier) for outlier in grid.outliers]
+    eps = operator_accuracy(data, offsets, noise_from_differences(data, offsets, turns=turns))
     bound = float(data.weight.sum(dtype=float)) * math.prod(grid.shape)  # of the operator's squared norm
     samples = Samples(data, offsets, np.ones(data.size, np.float32))
     problem = Problem.of(samples, grid, options, unit_jy=1.0, eps=eps, data_norm_sq=bound)
@@ -114,9 +114,7 @@ def measure(data, offsets, grid, options, reading):
     pair = _seconds(lambda: measurement.adjoint(measurement.forward(image)))
     # two iterations, and one Φ of the last image
     first = _seconds(lambda: nnls(measurement, problem.vis, problem.precond, bound, NNLSFit(max_iter=2))) / 2.5
-    dictionary = SaraDictionary(grid.shape, options.wavelets, options.wavelevels, nthreads=options.nthreads)
-    if grid.subbands is not None:
-        dictionary = SubbandDictionary(dictionary, grid.subbands.orders)
+    dictionary = problem.dictionary(options.wavelets, options)
     if options.method == PAPER:
         dictionary = paper_prior(dictionary, measurement)
     ppd = AdaptivePPD(measurement, dictionary, problem.vis, problem.offsets, problem.precond, bound, options.positivity)

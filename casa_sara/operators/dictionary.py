@@ -38,13 +38,31 @@ ORIENTATIONS = ("aa", "ad", "da", "dd")
 
 
 class Band(NamedTuple):
-    """Where one band lies: `coefs[band.slice]` is its 2-D array; `order` is that of a spectrum, 0 its mean."""
+    """Where one band lies; `order` is that of a spectrum, 0 its mean.
+
+    Of several images `part` are the coefficients of one, a slice of those of all, and their shape.
+    """
 
     basis: int
     level: int
     orientation: str
     slice: tuple[Any, ...]
     order: int = 0
+    part: tuple[Any, tuple[int, ...]] | None = None
+
+    def of(self, coefs: np.ndarray) -> np.ndarray:
+        """Return the 2-D array of this band, without a copy.
+
+        Parameters
+        ----------
+        coefs : real, of the shape of coefficients
+            The coefficients.
+
+        Returns
+        -------
+        real, 2-D
+        """
+        return (coefs if self.part is None else coefs[self.part[0]].reshape(self.part[1]))[self.slice]
 
 
 class SaraDictionary:
@@ -288,7 +306,7 @@ class SaraDictionary:
             if band.level:
                 by = displacement(self.wavelets[band.basis], band.level)
                 where = np.roll(blocks[band.level], [by[kind] for kind in band.orientation], (0, 1))
-            coefs[band.slice][where] *= self.dtype.type(factor)
+            band.of(coefs)[where] *= self.dtype.type(factor)
 
     def _checked(self, array, name, shape):
         return checked(array, name, shape, self.dtype)

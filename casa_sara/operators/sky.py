@@ -1,4 +1,4 @@
-"""The measurement operator of an image: two-dimensional, with the w-term, of a mosaic, or with a known spectrum.
+"""The measurement operator of an image: two-dimensional, with the w-term, of a mosaic, with a spectrum, with outliers.
 
 Where the brightness follows a power law of the frequency with a known index,
 
@@ -20,6 +20,7 @@ from casa_sara.operators._workers import Workers
 from casa_sara.operators.measurement import SMALLEST_EPS, MeasurementOperator, NoVisibilities, share_of
 from casa_sara.operators.modulated import ModulatedOperator, bessel_factors, terms_needed
 from casa_sara.operators.mosaic import MosaicOperator
+from casa_sara.operators.outliers import ImagesOperator, operator_of_images
 from casa_sara.operators.subbands import SubbandOperator
 from casa_sara.operators.widefield import WGridder, WTerm, w_operator
 from casa_sara.options import LARGEST_INDEX, ImageGrid
@@ -37,16 +38,16 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
                  freq_hz: np.ndarray | None = None, row_scale: np.ndarray | None = None, eps: float = 1e-6,
                  dtype: npt.DTypeLike = np.float32,
                  nthreads: int | Workers = 1, comm: Serial = SERIAL, beam: np.ndarray | None = None,
-                 ) -> (MeasurementOperator | ModulatedOperator | MosaicOperator | SubbandOperator | WGridder
-                       | NoVisibilities):
-    """Return the measurement operator of an image.
+                 ) -> (MeasurementOperator | ModulatedOperator | MosaicOperator | SubbandOperator | ImagesOperator
+          | WGridder | NoVisibilities):
+    """Return the measurement operator of an image, with its outliers where it has some.
 
     Parameters
     ----------
     uvw : float64 (3, M)
         Baselines in wavelengths.
     grid : casa_sara.options.ImageGrid
-        `shape`, `cell_rad`, `gridder`, `mosaic`, `spectrum` and `subbands` decide.
+        `shape`, `cell_rad`, `gridder`, `mosaic`, `spectrum`, `subbands` and `outliers` decide.
     freq_hz : real (M,), optional
         Frequencies; without them the sky is as bright at all frequencies as at the reference.
     row_scale, eps, dtype, nthreads
@@ -58,7 +59,7 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
 
     Returns
     -------
-    MeasurementOperator, ModulatedOperator, MosaicOperator, SubbandOperator, WGridder or NoVisibilities
+    MeasurementOperator, ModulatedOperator, MosaicOperator, SubbandOperator, ImagesOperator, WGridder or NoVisibilities
     """
     def of_place(row_scale, eps):
         if grid.mosaic is not None:
@@ -92,6 +93,9 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
 
 def _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm):
     """The operator of a sky that does not change with frequency."""
+    if grid.outliers:
+        return operator_of_images(uvw, grid, lambda uvw, grid, workers: _of_place(
+            uvw, grid, row_scale, eps, dtype, workers if workers and grid.gridder == "standard" else nthreads, comm))
     if grid.gridder == "standard":
         return share_of(uvw[:2], grid.cell_rad, grid.shape, row_scale=row_scale, eps=eps, dtype=dtype,
                         nthreads=nthreads,

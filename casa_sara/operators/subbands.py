@@ -267,7 +267,7 @@ class SubbandDictionary:
         return np.zeros((len(self._orders), *one), self._dictionary.dtype)
 
     def bands(self) -> list[Band]:
-        """Return the list of all bands: `coefs[band.slice]` is the 2-D array of one."""
+        """Return the list of all :class:`~casa_sara.operators.dictionary.Band`."""
         return [band._replace(slice=(order, *band.slice), order=order) for order in range(len(self._orders))
                 for band in self._dictionary.bands()]
 

@@ -76,6 +76,7 @@ TSARA = (
     Parameter('restoration', ('bool',), True, 'Do restoration steps (or not)'),
     Parameter('restoringbeam', ('string', 'stringVec'), [], 'Restoring beam shape to use. Default is the PSF main lobe', opener='restoration', open_on=(True,)),
     Parameter('pbcor', ('bool',), False, 'Apply PB correction on the output restored image', opener='restoration', open_on=(True,)),
+    Parameter('outlierfile', ('string',), '', 'Name of outlier-field image definitions'),
     Parameter('method', ('string',), 'tsara', 'Algorithm: that of this task, or exactly that of the paper', allowed=('tsara', 'dabbech2018')),
     Parameter('niter', ('int',), 100000, 'Maximum number of iterations; 0 makes dirty images only', minimum=0.0),
     Parameter('wavelets', ('stringVec',), ['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], 'Bases of the sparsity dictionary', allowed=('dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8')),

@@ -54,7 +54,11 @@ def summary(result: Result, options: SolverOptions, full: bool = False) -> dict[
     ends = _ends(result)
     code = record.stop_code if record else ITERATION_LIMIT
     minor = {"iterDone": ends, "peakRes": [result.residual_peak], "modelFlux": [result.model_flux]}
-    return _outcome(options, ends, code, {0: {0: minor}}, _sara(result, options, full))
+    outcome = _outcome(options, ends, code, {0: {0: minor}}, _sara(result, options, full))
+    outcome["summaryminor"] |= {number: {0: {0: {"iterDone": ends, "peakRes": [one.images.residual_peak],
+                                                 "modelFlux": [one.images.model_flux]}}}
+                                for number, one in enumerate(result.outliers, 1)}  # as tclean numbers image fields
+    return outcome
 
 
 def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False) -> dict[str, Any]:
@@ -198,6 +202,8 @@ def _sara(result, options, full):
     if result.subbands is not None:
         sara["spectra"] = {"frequencies_hz": result.subbands.freqs_hz, "reference_hz": result.subbands.reference_hz,
                            "shares": result.subbands.shares}
+    if result.outliers:
+        sara["outliers"] = [one.summary() for one in result.outliers]
     return sara | _solution(result, options, full)
 
 

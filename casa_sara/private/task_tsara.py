@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from casa_sara.casa.ms.block_selection import parsed
 from casa_sara.casa.ms.model_column import check_model_column_writable, incomplete_columns
 from casa_sara.casa.runtime import log
 from casa_sara.casa.runtime.lock import one_run_of
-from casa_sara.casa.runtime.quantities import hertz, radians, seconds
+from casa_sara.casa.runtime.quantities import hertz, seconds
 from casa_sara.imaging.continuum import make_image
 from casa_sara.imaging.cube import make_cube
 from casa_sara.imaging.dry_run import dry_run
@@ -43,13 +44,14 @@ from casa_sara.options import (
 )
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.private.launch import in_parallel
+from casa_sara.private.outlier_file import read_outlier_file
+from casa_sara.private.pixels import cell_rad, pair
 from casa_sara.private.summary import cube_summary, polarised_summary, summary
 from casa_sara.runtime.machine import available_cores
 from casa_sara.version import __version__
 
 __all__ = ["selection_of", "tsara"]
 
-ARCSEC = math.pi / 180 / 3600
 MOST_TERMS = 6
 
 
@@ -59,6 +61,7 @@ def tsara(**parameters: Any) -> dict[str, Any]:
     _refuse_for_mosaics(parameters)
     _check_single_dish(parameters)
     _refuse_for_spectra(parameters)
+    _refuse_for_outliers(parameters)
     _refuse_for_several_stokes(parameters)
     return in_parallel(run, parameters) if parameters["parallel"] else run(parameters)
 
@@ -86,6 +89,7 @@ def run(parameters: dict[str, Any], comm: Serial = SERIAL) -> dict[str, Any]:
     make, tell = _face_of(grid)
     with ExitStack() as stack:
         output = comm.once(_prepare, parameters, selection, grid, stack)
+        grid = _continued(grid, output)
         dish = SingleDish(parameters["sdimage"], parameters["sdpsf"], parameters["sdgain"])
         result = make(ImagingRequest(selection, grid, weighting, options, output, limits, dish),
                       lambda result: tell(result, options, full=True)["sara"], comm)
@@ -106,14 +110,21 @@ def _face_of(grid):
 def _prepare(parameters, selection, grid, stack):
     """Take the imagename for as long as the stack lasts, and return the options of the output."""
     more = 2 * parameters["pbcor"] + grid.masked + 2 * bool(parameters["ndraws"]) + parameters["jackknife"]
-    check_imagename(parameters["imagename"], grid.shape, len(grid.stokes) * (len(PRODUCTS) + more) - len(PRODUCTS))
-    stack.enter_context(one_run_of(parameters["imagename"]))
-    recover_products(parameters["imagename"])
-    output = _output(parameters)
+    more = len(grid.stokes) * (len(PRODUCTS) + more) - len(PRODUCTS)
+    for imagename, shape in zip(_imagenames(parameters, grid), grid.shapes):
+        check_imagename(imagename, shape, more)
+        stack.enter_context(one_run_of(imagename))
+        recover_products(imagename)
+    output = _output(parameters, grid)
     if output.savemodel == "modelcolumn":
         check_model_column_writable(selection)
     _warn_of_incomplete(selection.vis, output)
     return output
+
+
+def _imagenames(parameters, grid):
+    """Return the imagenames of the main image and of its outliers."""
+    return [parameters["imagename"], *(outlier.imagename for outlier in grid.outliers)]
 
 
 def _warn_of_incomplete(vis, output):
@@ -154,13 +165,15 @@ def _grid(parameters):
                          "-1, or 2 or more")
     if planes > 1:
         log.info(f"wprojplanes = {planes}: not used, the w-term is computed exactly, without planes")
-    shape = _pair(parameters["imsize"], "imsize", "one number of pixels, or two")
-    cells = [_cell_rad(value) for value in _pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
-    return ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
+    shape = pair(parameters["imsize"], "imsize", "one number of pixels, or two")
+    cells = [cell_rad(value) for value in pair(parameters["cell"], "cell", "one pixel size as '0.1arcsec', or two")]
+    grid = ImageGrid(tuple(int(n) for n in shape), tuple(cells), parameters["phasecenter"], parameters["projection"],
                      parameters["stokes"], parameters["reffreq"], gridder=parameters["gridder"],
                      spectralindex=_spectral_index(parameters), usemask=parameters["usemask"], mask=_mask(parameters),
                      pbmask=parameters["pbmask"], onepointing=parameters["onepointing"], nterms=parameters["nterms"],
                      **_spectral(parameters))
+    outliers = read_outlier_file(parameters["outlierfile"], grid, parameters["imagename"])
+    return replace(grid, outliers=outliers)
 
 
 def _spectral_index(parameters):
@@ -256,6 +269,28 @@ def _refuse_for_spectra(parameters):
             raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 
 
+def _refuse_for_outliers(parameters):
+    """Raise on parameters that outliers do not have."""
+    name = parameters["outlierfile"]
+    if not name:
+        return
+    for parameter, right, reason in (("specmode", "mfs", "outliers are of continuum images"),
+                                     ("gridder", ("standard", "wproject"), "outliers are of single pointings"),
+                                     ("stokes", "I", "outliers are of Stokes I"),
+                                     ("method", "tsara", "the paper has one image"),
+                                     ("nterms", 1, "the spectra of outliers are flat"),
+                                     ("spectralindex", "", "the spectra of outliers are flat"),
+                                     ("sdimage", "", "total power is of one image"),
+                                     ("ndraws", 0, "errors by bootstrap are of one image"),
+                                     ("jackknife", False, "errors by jackknife are of one image"),
+                                     ("report", False, "reports are made of one image"),
+                                     ("parallel", False, "outliers take one process")):
+        allowed = right if isinstance(right, tuple) else (right,)
+        if parameters[parameter] not in allowed:
+            raise ValueError(f"{parameter} = {parameters[parameter]!r} with outlierfile = '{name}': {reason}; should "
+                             f"be {' or '.join(map(repr, allowed))}")
+
+
 def _refuse_for_several_stokes(parameters):
     """Raise on parameters that images of several Stokes parameters do not have."""
     stokes = parameters["stokes"]
@@ -326,24 +361,6 @@ def _mask(parameters):
     return entries
 
 
-def _pair(value, name, right):
-    values = list(value) if isinstance(value, (list, tuple)) else [value]
-    if len(values) not in (1, 2):
-        raise ValueError(f"{name} = {value!r}: should be {right}")
-    return values * 2 if len(values) == 1 else values
-
-
-def _cell_rad(value):
-    """One pixel size in radians; a number without unit is in arcsec, as in tclean."""
-    try:
-        size = float(value) * ARCSEC
-    except ValueError:
-        size = radians(value, "cell")
-    if not 0 < size < 1:
-        raise ValueError(f"cell = {value!r}: should be a positive angle, e.g. '0.1arcsec'")
-    return size
-
-
 def _seconds(maxtime):
     """The time limit in seconds, a number without unit being minutes; infinite where there is none."""
     if maxtime == "":
@@ -377,12 +394,13 @@ def _own_cores(comm):
     return max(1, available_cores() // comm.same_here(cores))
 
 
-def _output(parameters):
+def _output(parameters, grid):
     imagename = parameters["imagename"]
     startmodel = parameters["startmodel"]
-    old, checkpoint = existing_products(imagename), imagename + CHECKPOINT
+    names = _imagenames(parameters, grid)
+    old, checkpoint = sum(map(existing_products, names), []), imagename + CHECKPOINT
     images_stand = (parameters["restart"] and parameters["niter"] == 0 and parameters["savemodel"] == "modelcolumn"
-                    and imagename + ".model" in old)
+                    and {name + ".model" for name in names} <= set(old))
     unfinished = os.path.lexists(checkpoint) and not images_stand
     if parameters["restart"]:
         if not unfinished:
@@ -397,6 +415,15 @@ def _output(parameters):
     return Output(imagename, startmodel, _blocks(parameters), beam, parameters["savemodel"], images_stand,
                   tuple(history_lines("tsara", parameters)), parameters["restart"] and unfinished,
                   parameters["pblimit"], parameters["pbcor"])
+
+
+def _continued(grid, output):
+    """Return the grid whose outliers go on from their old models where the main image does."""
+    if output.startmodel != output.imagename + ".model":
+        return grid
+    models = {outlier: outlier.imagename + ".model" for outlier in grid.outliers}
+    return replace(grid, outliers=tuple(replace(outlier, startmodel=model) if os.path.lexists(model) else outlier
+                                        for outlier, model in models.items()))
 
 
 def _model_to_continue(imagename, startmodel, old):

@@ -15,11 +15,14 @@ from casa_sara.data.averaging import WORTHWHILE, Averaged, cell_sides
 from casa_sara.data.distribution import Layout
 from casa_sara.data.outliers import find_wild
 from casa_sara.data.visibilities import Visibilities
+from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import Summed
 from casa_sara.operators.norms import power_method
+from casa_sara.operators.outliers import ImagesDictionary, extents
 from casa_sara.operators.piecewise import operator_on_disk
 from casa_sara.operators.single_dish import Stacked
 from casa_sara.operators.sky import sky_operator
+from casa_sara.operators.subbands import SubbandDictionary
 from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
@@ -116,7 +119,8 @@ class Problem:
     `vis`, `offsets`, `measurement` and `precond` are of the averages where the samples are `averaged`, and of all
     `samples` where that is None; those of a single `dish`, where there is one, come after them, a block of their own.
     `support` is None where all pixels may be non-zero. Of a mosaic the sky is the image times `sky_over_image`; with
-    `subbands` the images of several frequencies are stacked.
+    `subbands` the images of several frequencies are stacked. `shapes` are those of the main image and of its outliers,
+    which are stacked too.
     """
 
     samples: Samples
@@ -131,6 +135,7 @@ class Problem:
     sky_over_image: np.ndarray | None = None
     dish: WhitenedDish | None = None
     subbands: Any = None
+    shapes: tuple[tuple[int, int], ...] = ()
 
     @classmethod
     def of(cls, samples: Samples, grid: ImageGrid, options: SolverOptions,  # noqa: PLR0913 - four have a default
@@ -198,7 +203,27 @@ class Problem:
         if support is not None and grid.subbands is not None:
             support = np.tile(support, (grid.subbands.n_terms, 1))
         return cls(samples, vis, offsets, measurement, precond, data_norm_sq, unit_jy, support, averaged,
-                   grid.mosaic and grid.mosaic.over, dish, grid.subbands)
+                   grid.mosaic and grid.mosaic.over, dish, grid.subbands, grid.shapes)
+
+    def dictionary(self, wavelets: tuple[str, ...], options: SolverOptions) -> Any:
+        """Return Ψ of the image, or of all that are stacked.
+
+        Parameters
+        ----------
+        wavelets : tuple of str
+            The bases of this rank.
+        options : SolverOptions
+            Task parameters of the method.
+
+        Returns
+        -------
+        SaraDictionary, SubbandDictionary or ImagesDictionary
+        """
+        each = [SaraDictionary(shape, wavelets, options.wavelevels, nthreads=options.nthreads,
+                               n_bases=len(options.wavelets)) for shape in self.shapes]
+        if self.subbands is not None:
+            return SubbandDictionary(each[0], self.subbands.orders)
+        return each[0] if len(each) == 1 else ImagesDictionary(each)
 
     @property
     def renewing(self) -> Averaged | Beside | None:
@@ -248,7 +273,7 @@ def _averages(average, samples, finer, grid, options):
             found = average(finer)
             comm = found[0].comm
             averages, most = comm.total(found[0].cells.size), WORTHWHILE * comm.total(samples.data.size)
-        if not enlarging or averages <= prod(grid.shape) or finer.min() == -MOST_DOUBLINGS:
+        if not enlarging or averages <= sum(map(prod, grid.shapes)) or finer.min() == -MOST_DOUBLINGS:
             break
         finer = finer - 1
     if averages <= most < inf:
@@ -274,7 +299,8 @@ def _whitened_operator(data, operator, grid, options, unit_jy):
 def averaging_cell(grid: ImageGrid) -> np.ndarray:
     """Return the sides of the cells within which samples are averaged: :func:`casa_sara.data.averaging.cell_sides`.
 
-    Of a mosaic the sides along u and v are those of the widest beam.
+    An outlier is as far from the centre as the corner of an image that would hold it. Of a mosaic the sides along u and
+    v are those of the widest beam.
 
     Parameters
     ----------
@@ -290,6 +316,9 @@ def averaging_cell(grid: ImageGrid) -> np.ndarray:
     if grid.subbands is not None:
         index = STEEPEST
     depth = WTerm.of(0.0, grid.shape, grid.cell_rad, 1.0).depth if grid.gridder == "wproject" else 0.0
+    if grid.outliers:  # an image of two pixels that reaches as far as all of them
+        *reach, beyond = extents(grid)
+        return cell_sides((2, 2), reach, max(depth, beyond), index)
     shape = grid.shape
     if grid.mosaic is not None:
         boxes = [beam.box(grid.shape, grid.cell_rad) for beam in grid.mosaic.beams]

@@ -83,7 +83,8 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     options : SolverOptions
         Task parameters of the method.
     startmodel : real (nx, ny), optional
-        First image, Jy/pixel.
+        First image, Jy/pixel. It and `support` are stacked where there are outliers:
+        :func:`casa_sara.operators.outliers.stacked`.
     control : Control
         What ends the solution early, and keeps its state.
     support : bool (nx, ny), optional
@@ -99,7 +100,8 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     ------
     ValueError
         Noise levels that are neither one for all blocks nor one for each; too few blocks for a jackknife; errors
-        asked for with the paper's method; total power with errors, with bounds that do not adapt, or on several ranks.
+        asked for with the paper's method; total power with errors, with bounds that do not adapt, or on several ranks;
+        outliers with errors, with the paper's method, or on several ranks.
     CheckpointError
         The state that was read is not one of these data.
     """
@@ -122,7 +124,7 @@ def reconstruction_steps(samples: Samples, grid: ImageGrid, options: SolverOptio
     Reconstruction
     """
     comm, checkpoint = ranks.comm, control.checkpoint
-    _check(options, samples, comm)
+    _check(options, grid, samples, comm)
     flat = FlatNoise.of(samples.data, grid, comm)
     if flat is not None:
         grid, support, startmodel = flat.grid(grid), flat.support(support), flat.image(startmodel)
@@ -164,12 +166,14 @@ def _solve(solution, samples, averaging, options, control, layout, ranks):
         control.then(solution.ppd, solution.bounds, record)
 
 
-def _check(options, samples, comm):
+def _check(options, grid, samples, comm):
     """Raise where options, image and data do not go together."""
     blocks = len(samples.offsets) - 1
     if samples.total_power is not None:
         _check_total_power(options, comm)
     check_l2bound(options, blocks)
+    if grid.outliers:
+        _check_outliers(options, comm)
     if options.jackknife:
         jackknife_groups(blocks)
     if (options.ndraws or options.jackknife) and options.method == PAPER:
@@ -183,6 +187,14 @@ def _check_total_power(options, comm):
                  jackknife=options.jackknife, parallel=comm.size > 1)
     for name in (name for name, is_wrong in wrong.items() if is_wrong):
         raise ValueError(f"{name} = {getattr(options, name, True)!r} is not possible with total power")
+
+
+def _check_outliers(options, comm):
+    """Raise where there cannot be outliers beside the image."""
+    wrong = dict(method=options.method == PAPER, ndraws=options.ndraws > 0, jackknife=options.jackknife,
+                 parallel=comm.size > 1)
+    for name in (name for name, is_wrong in wrong.items() if is_wrong):
+        raise ValueError(f"{name} = {getattr(options, name, True)!r} is not possible with outliers")
 
 
 def _averaging(solution, sides):
@@ -290,12 +302,13 @@ def _result(solution, record, samples, averaging, comm, goes_on):
             f"{name}_jy_per_beam": float(norms[-1] / np.sqrt(2 * ppd.samples[-1]) / solution.dish.scale)
             for name, norms in whitened.items()}
     return Reconstruction(
-        ppd.planes.at_reference(model), bounds.l2_bounds[:blocks], ppd.residual_norms[:blocks].copy(),
-        found.nnls_norms[:blocks], record,
+        np.ascontiguousarray(ppd.planes.at_reference(model)), bounds.l2_bounds[:blocks],
+        ppd.residual_norms[:blocks].copy(), found.nnls_norms[:blocks], record,
         data_norm_sq=found.data_norm_sq / unit_jy**2, threshold=ppd.threshold * unit_jy,
         noise_jy_per_beam=unit_jy * bounds.total_weight**-0.5, kept=np.delete(samples.kept, found.left_out),
         wild=found.wild, averaging=averaging, total_power=total_power,
         spectra=None if subbands is None else subbands.spectra(model),
+        outliers=[image.copy() for image in ppd.planes.looked_at(model)[1:]],
         **{name: resampling.draws for name, resampling in resamplings.items()})
 
 

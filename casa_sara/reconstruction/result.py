@@ -48,6 +48,8 @@ class Reconstruction:
         Of the bootstrap and of the jackknife, where asked for and the solution has come to an end.
     spectra : float32 (T, nx, ny) or None
         The model at several frequencies, Jy/pixel, where it was solved for at these; `model` is that at the reference.
+    outliers : list of float32 (nx, ny)
+        The models of the outliers, Jy/pixel.
     """
 
     model: np.ndarray
@@ -65,6 +67,7 @@ class Reconstruction:
     draws: Draws | None = None
     jackknife: Draws | None = None
     spectra: np.ndarray | None = None
+    outliers: list[np.ndarray] = field(default_factory=list)
 
     @classmethod
     def of(cls, state: dict[str, Any]) -> Reconstruction:

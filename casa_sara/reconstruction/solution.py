@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 
 from casa_sara.data.distribution import Layout
-from casa_sara.operators.dictionary import SaraDictionary
-from casa_sara.operators.subbands import SubbandDictionary
 from casa_sara.options import SolverOptions
 from casa_sara.parallel.partition import RankAssignment
 from casa_sara.reconstruction.bootstrap import Bootstrap, Jackknife, jackknife_groups
@@ -24,7 +22,7 @@ from casa_sara.reconstruction.total_power import MOST, WhitenedDish
 from casa_sara.solver.adaptive_ppd import BASIS_ARRAYS, SAMPLE_ARRAYS, AdaptivePPD
 from casa_sara.solver.dabbech2018 import PaperBounds, PaperStage
 from casa_sara.solver.l2_bounds import AdaptiveBounds, GivenBounds
-from casa_sara.solver.planes import Planes
+from casa_sara.solver.planes import Images, Planes
 from casa_sara.solver.record import DIVERGED, UNFINISHED, SolverRecord
 from casa_sara.solver.reweighting import Stage
 from casa_sara.solver.significance import SignificantSupport
@@ -68,12 +66,8 @@ class Solution:
         Solution
         """
         measurement, samples = problem.measurement, problem.samples
-        nx, ny = measurement.shape
-        subbands, planes = problem.subbands, _planes(problem.subbands, options.positivity)
-        dictionary: Any = SaraDictionary((nx // planes.n_planes, ny), ranks.wavelets(options.wavelets),
-                                         options.wavelevels, nthreads=options.nthreads, n_bases=len(options.wavelets))
-        if subbands is not None:
-            dictionary = SubbandDictionary(dictionary, subbands.orders)
+        subbands, planes = problem.subbands, _planes(problem, options.positivity)
+        dictionary = problem.dictionary(ranks.wavelets(options.wavelets), options)
         if options.method == PAPER:
             ppd = paper_iteration(problem, dictionary, found.data_norm_sq, options.positivity)
         else:
@@ -178,7 +172,7 @@ def begin(samples: Samples, problem_of: Callable[..., Problem], options: SolverO
     """
     problem, found, first = first_image(samples, problem_of, options, stopped, ranks.comm)
     if startmodel is not None:
-        startmodel = _planes(problem.subbands).stacked(startmodel / np.float32(problem.unit_jy))
+        startmodel = _planes(problem).stacked(startmodel / np.float32(problem.unit_jy))
         if problem.support is not None:
             startmodel *= problem.support
     if options.method == PAPER:
@@ -190,7 +184,8 @@ def begin(samples: Samples, problem_of: Callable[..., Problem], options: SolverO
         solution = Solution.of(problem, found, options, ranks)
         found.noise_only = _is_noise_only(solution.ppd, solution.bounds)
         model = first if startmodel is None else startmodel
-        threshold = STEP_BALANCE * _mean_brightness(model)
+        main = solution.ppd.planes.main(model)
+        threshold = STEP_BALANCE * _mean_brightness(main if main.any() else model)
     solution.ppd.start_from(model)
     solution.ppd.rescale(threshold)
     return solution
@@ -268,10 +263,11 @@ def _plain_state(state, comm):
     return state | dict(ppd=state["ppd"] | {name: spread.get(name) for name in (*SAMPLE_ARRAYS, *BASIS_ARRAYS)})
 
 
-def _planes(subbands, positivity=True):
+def _planes(problem, positivity=True):
     """Return the planes of the unknown."""
+    subbands = problem.subbands
     if subbands is None:
-        return Planes()
+        return Planes() if len(problem.shapes) == 1 else Images(problem.shapes)
     return Planes(np.sqrt(subbands.shares), subbands.reference_weights(), positivity)
 
 

@@ -134,7 +134,9 @@ class AdaptivePPD:
     sky_over_image : real (nx, ny) or None
         Of a mosaic, by which the model is multiplied to be the sky, for the record.
     planes : Planes
-        Those of which (nx, ny) are stacked here, where the sky is solved for at several frequencies.
+        The images that are stacked here, (nx, ny) being of all together: of several frequencies, or of several parts of
+        the sky. Flux and maximum are then those of what was asked for, and σ is that of all or of the main image,
+        whichever is larger.
     """
 
     def __init__(self, measurement: Measurement, dictionary: Prior,  # noqa: PLR0913 - Φ, Ψ, y, U of the paper
@@ -334,13 +336,19 @@ class AdaptivePPD:
         self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, *gradients, steps,
                                      self.lowest, self._sums, part=self.comm.part)
         self.comm.barrier()
-        sums, greatest = self._sums[:, :3].sum(axis=0), self._sums[:, 3].max()
+        of_parts = np.array([self._sums[part, :3].sum(axis=0) for part in self.planes.parts])
+        greatest = self._sums[:, 3].max()
         if len(self.points):
             if self.comm.part[0] == 0:
-                sums += self.points.project(self.model, self.anchor, self.model_bar, points_before)
+                of_parts += self.points.project(self.model, self.anchor, self.model_bar, points_before,
+                                                self.planes.places(self.points))
             self.comm.barrier()
-            sums, greatest = np.maximum(sums, (0, 0, -np.inf)), self.model.max()
-        self.account_for(self.comm.bcast_numbers([*sums.tolist(), float(greatest)]))
+            of_parts, greatest = np.maximum(of_parts, (0, 0, -np.inf)), self.model.max()
+        self.account_for(self.comm.bcast_numbers([*of_parts.sum(axis=0).tolist(), float(greatest)]))
+        if len(of_parts) > 1:  # what is bright elsewhere must not hide that the main image still changes
+            whole = self.rel_change
+            self.account_for([*of_parts[0].tolist(), float(self.planes.main(self.model).max())])
+            self.rel_change = max(self.rel_change, whole)
         if self.planes.n_planes > 1 or self.sky_over_image is not None:
             seen = self._seen() if self.comm.rank == 0 else np.zeros(1)  # the others wait before they change the model
             self.model_flux, self.model_max = self.comm.bcast_numbers([float(seen.sum(dtype=float)), float(seen.max())])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -30,18 +31,23 @@ def look_at(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, record: Solv
     bounds : GivenBounds or AdaptiveBounds
         Bounds of its blocks, from which the noise levels follow.
     record : SolverRecord
-        `islands` and `residual_snr` are set.
+        `islands` and `residual_snr` are set; islands of other parts of the sky than the first have its number `part`.
 
     Returns
     -------
     bool
         Whether the residual holds structure of more than 5 standard deviations over more than a beam.
     """
-    filter_ = matched_filter(ppd, bounds)
-    gradient = ppd.planes.mean(gradient_image(ppd, bounds, ppd.model))
-    record.residual_snr = ppd.comm.once(_peaks, filter_, gradient)
-    record.islands = ppd.comm.once(islands_of, ppd.planes.at_reference(ppd.model), filter_.psf, ppd.unit_jy,
-                                   ppd.sky_over_image)
+    planes = ppd.planes
+    filters = [matched_filter(ppd, bounds, part) for part in range(len(planes.parts))]
+    gradients = planes.means(gradient_image(ppd, bounds, ppd.model))
+    peaks = [ppd.comm.once(_peaks, *one) for one in zip(filters, gradients)]
+    record.residual_snr = [max(of_width, key=lambda peak: peak["snr"]) for of_width in zip_longest(
+        *peaks, fillvalue=dict(snr=-np.inf))]
+    record.islands = []
+    for part, (model, filter_) in enumerate(zip(planes.looked_at(ppd.model), filters)):
+        islands = ppd.comm.once(islands_of, model, filter_.psf, ppd.unit_jy, ppd.sky_over_image)
+        record.islands += islands if part == 0 else [island | dict(part=part) for island in islands]
     return any(entry["snr"] > STRUCTURE for entry in record.residual_snr if entry["beams"] >= 1)
 
 

@@ -49,8 +49,8 @@ def band_noise(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds,
         draw_noise(ppd, rng, np.sqrt(bounds.noise_weights), noise)
         image = ppd.adjoint(noise, ppd.scratch_image)
         coefs = dictionary.analysis(image, ppd.l1_weights)
-        bands += [_mean_square(coefs[band.slice]) for band in dictionary.bands()]
-        pixel += _mean_square(image)
+        bands += [_mean_square(band.of(coefs)) for band in dictionary.bands()]
+        pixel += _mean_square(ppd.planes.main(image))
     scale = bounds.total_weight * np.sqrt(draws)
     return np.maximum(np.sqrt(bands) / scale, 1e-30), np.sqrt(pixel / dictionary.n_bases) / scale
 
@@ -77,7 +77,7 @@ def first_weights(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, confin
     """
     noise, pixel = band_noise(ppd, bounds)
     for band, scale in zip(ppd.dictionary.bands(), _band_scales(ppd, noise, pixel) * _shares(ppd, confined)):
-        ppd.l1_weights[band.slice] = scale
+        band.of(ppd.l1_weights)[...] = scale
 
 
 def _band_scales(ppd, noise, pixel):

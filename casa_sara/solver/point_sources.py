@@ -8,6 +8,8 @@ a·s there, a ≥ 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -76,7 +78,8 @@ class PointSources:
         """
         return image[self.x, self.y].astype(float)
 
-    def project(self, model: np.ndarray, anchor: np.ndarray, model_bar: np.ndarray, before: np.ndarray) -> np.ndarray:
+    def project(self, model: np.ndarray, anchor: np.ndarray, model_bar: np.ndarray, before: np.ndarray,
+                groups: Sequence[np.ndarray | slice] = (slice(None),)) -> np.ndarray:
         """Project x⁺ on {a·s, a ≥ 0} around every source, in place, and x̄ = 2x⁺ − z with it: Step 17 there.
 
         Parameters
@@ -85,10 +88,12 @@ class PointSources:
             x⁺, z and x̄.
         before : float (n, 36)
             :meth:`values` of x.
+        groups : sequence of int arrays or slices
+            Sources whose changes are wanted together.
 
         Returns
         -------
-        float (3,)
+        float (number of groups, 3)
             What this changes in Σ(x⁺ − x)², Σ(x⁺)² and Σx⁺.
         """
         free = self.values(model)
@@ -97,8 +102,8 @@ class PointSources:
         model[self.x, self.y] = held
         model_bar[self.x, self.y] = 2 * held - anchor[self.x, self.y]
         held = held.astype(float)
-        return np.array([(np.square(held - before) - np.square(free - before)).sum(),
-                         (np.square(held) - np.square(free)).sum(), (held - free).sum()])
+        changes = (np.square(held - before) - np.square(free - before), np.square(held) - np.square(free), held - free)
+        return np.array([[change[group].sum() for change in changes] for group in groups])
 
 
 def _lagrange(offset):

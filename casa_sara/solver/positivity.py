@@ -56,14 +56,14 @@ class Release:
         int
             Number of pixels with a negative lower bound that had none before.
         """
-        around_pixel = (1, 2 * REACH + 1, 2 * REACH + 1)  # of each plane
-        lobes = (LOBE * maximum_filter(ppd.planes.split(ppd.model), around_pixel)).reshape(ppd.model.shape)
+        around_pixel = (2 * REACH + 1, 2 * REACH + 1)
+        lobes = LOBE * ppd.planes.each(lambda model: maximum_filter(model, around_pixel), ppd.model)
         asked, before = _asked(ppd, bounds, lobes), self._asked
         self._asked = asked
         again = (before < 0) & (asked < PERSISTENT * before)
         if not again.any():
             return 0
-        around = binary_dilation(ppd.planes.split(again), np.ones(around_pixel, bool)).reshape(again.shape)
+        around = ppd.planes.each(lambda one: binary_dilation(one, np.ones(around_pixel, bool)), again)
         count = np.count_nonzero(ppd.lowest)
         ppd.comm.barrier()  # all ranks of one machine have counted, and write the same
         np.minimum(ppd.lowest, -lobes, out=ppd.lowest, where=around & (ppd.lowest < np.inf))

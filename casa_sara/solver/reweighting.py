@@ -303,7 +303,7 @@ def _stop_code(ppd, bounds, schedule, stage):
 
 def _renew_weights(ppd, bounds, schedule, stage):
     """Re-weight by the present solution; return False, with nothing done, when one more would change nothing."""
-    change = ppd.comm.bcast_numbers([_relative(ppd.model, stage.previous)])[0]
+    change = ppd.comm.bcast_numbers([_change(ppd.planes, ppd.model, stage.previous)])[0]
     stage.previous[...] = ppd.model
     if stage.k in OF_COSTLY or ppd.averaged is None or not ppd.averaged.costly:
         ppd.renew_averages(stage.previous)
@@ -339,6 +339,12 @@ def _is_steady(residual_norms, interval):
     """Whether the residual has changed by less than `STEADY` within the last interval."""
     recent = residual_norms[-interval:]
     return len(recent) == interval and max(recent) - min(recent) < STEADY * recent[-1]
+
+
+def _change(planes, model, previous):
+    """Return the relative change of the model: of all of it, or of the main image, whichever is larger."""
+    change = _relative(model, previous)
+    return change if len(planes.parts) == 1 else max(change, _relative(planes.main(model), planes.main(previous)))
 
 
 def _relative(model, previous):

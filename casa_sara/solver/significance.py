@@ -49,8 +49,8 @@ class SignificantSupport:
     def __init__(self, significance: float, begun: bool = False) -> None:
         self.significance, self.begun = float(significance), bool(begun)
         self._noise_weights: np.ndarray | None = None  # for which there are a point response and a filter
-        self._psf: np.ndarray = np.zeros(0)
-        self._filter: MatchedFilter | None = None
+        self._psfs: list[np.ndarray] = []
+        self._filters: list[MatchedFilter | None] = []
 
     def update(self, ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> int:
         """Confine the model to what is significant now.
@@ -68,19 +68,21 @@ class SignificantSupport:
             Pixels of the support.
         """
         planes = ppd.planes
-        gradient = planes.mean(gradient_image(ppd, bounds, ppd.model))
+        gradients = planes.means(gradient_image(ppd, bounds, ppd.model))
         if self._noise_weights is None or not np.array_equal(self._noise_weights, bounds.noise_weights):
-            self._psf, self._filter, self._noise_weights = point_response(ppd, bounds), None, bounds.noise_weights
-        allowed = np.ones(gradient.shape, bool) if ppd.confined_to is None else planes.split(ppd.confined_to)[0]
-        support, points = ppd.comm.once(self._found, gradient, planes.mean(ppd.model), allowed, ppd.positivity,
-                                        ppd.measurement.workers.count)
+            self._psfs = [point_response(ppd, bounds, part) for part in range(len(gradients))]
+            self._filters, self._noise_weights = [None] * len(gradients), bounds.noise_weights
+        images = zip(gradients, planes.means(ppd.model), planes.allowed(ppd.confined_to, ppd.model))
+        found = [ppd.comm.once(self._found, part, *image, ppd.positivity, ppd.measurement.workers.count)
+                 for part, image in enumerate(images)]
         self.begun = True
-        ppd.support_only(planes.repeated(support), planes.points(points, ppd.model.shape))
-        return int(np.count_nonzero(support))
+        supports, points = zip(*found)
+        ppd.support_only(planes.joined(supports), planes.points(points, ppd.model.shape))
+        return int(sum(map(np.count_nonzero, supports)))
 
-    def _found(self, gradient, model, allowed, positivity, workers):
-        """Return the support and the point sources in it."""
-        self._filter = filter_ = self._filter or MatchedFilter(self._psf, workers)
+    def _found(self, part, gradient, model, allowed, positivity, workers):
+        """Return the support of one part of the sky and the point sources in it."""
+        self._filters[part] = filter_ = self._filters[part] or MatchedFilter(self._psfs[part], workers)
         signed = (lambda snr: snr) if positivity else np.abs
         spectrum = filter_.spectrum(gradient)
         if not self.begun:
@@ -113,7 +115,7 @@ class SignificantSupport:
         return dict(significance=self.significance, begun=self.begun)
 
 
-def matched_filter(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> MatchedFilter:
+def matched_filter(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, part: int = 0) -> MatchedFilter:
     """Return the :class:`MatchedFilter` of the data with the present noise levels.
 
     Parameters
@@ -122,16 +124,18 @@ def matched_filter(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> Ma
         The iteration, whose model is looked at.
     bounds : GivenBounds or AdaptiveBounds
         Bounds of its blocks, from which the noise levels follow.
+    part : int
+        Number of the part of the sky.
 
     Returns
     -------
     MatchedFilter
     """
-    return MatchedFilter(point_response(ppd, bounds), ppd.measurement.workers.count)
+    return MatchedFilter(point_response(ppd, bounds, part), ppd.measurement.workers.count)
 
 
-def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> np.ndarray:
-    """Return Φ†Σ⁻¹Φ of a pixel of 1 in the middle of the image, real (nx, ny).
+def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, part: int = 0) -> np.ndarray:
+    """Return Φ†Σ⁻¹Φ of a pixel of 1 in the middle of an image, real (nx, ny).
 
     Parameters
     ----------
@@ -139,16 +143,18 @@ def point_response(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds) -> np
         The iteration, whose model is looked at.
     bounds : GivenBounds or AdaptiveBounds
         Bounds of its blocks, from which the noise levels follow.
+    part : int
+        Number of the part of the sky.
 
     Returns
     -------
     real (nx, ny)
     """
-    vis, image = ppd.scratch_vis, ppd.scratch_image
-    ppd.planes.set_pixel(image, tuple(n // 2 for n in ppd.planes.split(image).shape[1:]))
+    vis, image, planes = ppd.scratch_vis, ppd.scratch_image, ppd.planes
+    planes.set_pixel(image, tuple(n // 2 for n in planes.split(image)[part].shape), part)
     ppd.measurement.forward(image, vis)
     vis *= _whitening(ppd, bounds)
-    return ppd.planes.mean(ppd.adjoint(vis, image)).copy()
+    return planes.means(ppd.adjoint(vis, image))[part].copy()
 
 
 def gradient_image(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, model: np.ndarray) -> np.ndarray:

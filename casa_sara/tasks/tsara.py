@@ -386,6 +386,28 @@ class _tsara:
         of the telescope and no diameter of its antennas, .pb is 1 everywhere and has no effect, and a
         warning says so.
 
+    outlierfile : str, default ''
+        A text file, as tclean's, of small images elsewhere on the sky that are solved together with the
+        main one: a bright source far off, whose sidelobes reach the image, then needs no huge image. Each
+        begins with its imagename, has a support and products of its own, and the weights and noise levels
+        of the data are those of all:
+          imagename=bright1
+          imsize=[128,128]
+          cell=[2.0arcsec,2.0arcsec]
+          phasecenter=J2000 19:58:40.895 +40.55.58.543
+          mask=circle[[64pix,64pix],10pix]
+        phasecenter is a direction. imsize and cell are those of the main image where they are not given;
+        mask, usemask, pbmask and startmodel are optional, and none where they are not given. Lines that
+        begin with # are comments. Other parameters of tclean's file may stand there where they say what
+        holds for the main image, and are refused with their line where they do not; deconvolver always is.
+        The images must not overlap. Models are those of the sky times the primary beam at their place,
+        and masked in .residual and .image where that is below pblimit, unless pblimit is negative. savemodel
+        and restart hold for all of them.
+        Not available with it: specmode='cube', gridder='mosaic', stokes other than 'I',
+        method='dabbech2018', nterms above 1, spectralindex, sdimage, ndraws, jackknife, report=True and
+        parallel=True.
+        Example: outlierfile='outliers.txt'
+
     method : {'tsara', 'dabbech2018'}, default 'tsara'
         Both solve the same problem with the same operators, and make the same products:
           'tsara'        the algorithm with the changes that docs/decisions.md explains; nothing else
@@ -653,7 +675,8 @@ class _tsara:
       noise and bound of each block with its snapshot ('blocks'), to how many averages the
       visibilities were reduced for the solver, in uv cells of which size ('averaging', empty where
       they were not), how many points of sdimage were used and the noise found of them in Jy/beam
-      ('total_power', where there is one), the history of re-weightings and iterations, the parameters that were
+      ('total_power', where there is one), what was found in the images of outlierfile ('outliers', where
+      there are some), the history of re-weightings and iterations, the parameters that were
       chosen automatically and why, how many samples were left out for which reason ('dropped'), and
       the iterations from which the run was resumed ('resumed').
 
@@ -689,7 +712,7 @@ class _tsara:
         nterms=1, nchan=-1, start='', width='', outframe='LSRK', veltype='radio', restfreq=[], interpolation='nearest',
         perchanweightdensity=True, gridder='standard', onepointing=False, wprojplanes=-1, usepointing=False,
         mosweight=True, pblimit=0.2, weighting='natural', robust=0.5, npixels=0, uvtaper=[], restoration=True,
-        restoringbeam=[], pbcor=False, method='tsara', niter=100000,
+        restoringbeam=[], pbcor=False, outlierfile='', method='tsara', niter=100000,
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
         mask='', pbmask=0.0, positivity=True, polbound=False, precondition=True, databound='adapt', boundtol=0.01,
         boundrelchange=0.01, boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618,

@@ -12,8 +12,8 @@ import numpy as np
 from casa_sara.casa.ms.subtables import check_rows, readable
 from casa_sara.casa.runtime.tools import opened
 
-__all__ = ["Geometry", "direction_measure", "image_basis", "image_direction", "is_of_earth", "on_sky",
-           "rotation_between", "separation", "turn_to_frame", "unit_vectors"]
+__all__ = ["Geometry", "direction_measure", "direction_on_sky", "image_basis", "image_direction", "is_of_earth",
+           "on_sky", "rotation_between", "separation", "turn_to_frame", "unit_vectors"]
 
 SPEED_OF_LIGHT = 299_792_458.0
 _FIXED_FRAMES = ("J2000", "ICRS", "B1950", "B1950_VLA", "GALACTIC", "SUPERGAL", "ECLIPTIC")
@@ -44,6 +44,25 @@ def image_direction(phasecenter, selected):
     """
     first = selected[0]
     return _as_kept(on_sky(_direction_of(phasecenter, first), first, first.start_s))
+
+
+def direction_on_sky(phasecenter):
+    """Return the direction measure of a `phasecenter` that is a direction on the sky, no field.
+
+    Parameters
+    ----------
+    phasecenter : str
+        '[FRAME] LONGITUDE LATITUDE'.
+
+    Raises
+    ------
+    ValueError
+        It is something else.
+    """
+    if not str(phasecenter).strip() or str(phasecenter).strip().isdigit():
+        raise ValueError(f"phasecenter = '{phasecenter}': should be a direction on the sky, 'J2000 19h59m28.5s "
+                         "+40d44m02s' and the like")
+    return _as_kept(_direction_of(phasecenter, None))
 
 
 def is_of_earth(direction):
