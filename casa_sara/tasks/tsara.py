@@ -308,8 +308,8 @@ class _tsara:
         same noise everywhere, as tclean's with normtype='flatnoise'; .image.pbcor and .model.pbcor are the
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
-        The model is zero where .pb is below 0.1. The visibilities of a mosaic are not averaged. Not available
-        with 'mosaic': specmode='cube', parallel=True, ndraws and jackknife.
+        The model is zero where .pb is below 0.1. .model.error is that of the sky, .image.error of the sky
+        times .pb. Not available with 'mosaic': specmode='cube'.
 
     onepointing : bool, default False
         Opened by gridder = 'standard' or 'wproject'.
