@@ -261,13 +261,15 @@ def _refuse_for_spectra(parameters):
     if parameters["gridder"] == "wproject":
         raise ValueError(f"gridder = 'wproject' with nterms = {nterms}: the w-term is modelled of flat, or of known "
                          "spectra; should be 'standard' or 'mosaic'")
+    if parameters["gridder"] == "mosaic" and (parameters["ndraws"] or parameters["jackknife"]):
+        raise ValueError(f"ndraws = {parameters['ndraws']}, jackknife = {parameters['jackknife']} with nterms = "
+                         f"{nterms} and gridder = 'mosaic': errors of spectra are of single pointings; should be 0 "
+                         "and False")
     for name, right, reason in (("method", "tsara", "the paper's method has one image"),
                                 ("stokes", "I", "spectra are those of the brightness"),
                                 ("positivity", True, "the brightness is positive at all frequencies"),
                                 ("spectralindex", "", "either the index is known, or it is solved for"),
-                                ("parallel", False, "spectra take one process"),
-                                ("ndraws", 0, "errors by bootstrap are of one image"),
-                                ("jackknife", False, "errors by jackknife are of one image")):
+                                ("parallel", False, "spectra take one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 
