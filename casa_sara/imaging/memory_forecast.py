@@ -86,7 +86,8 @@ class Workload:
     blocks: int = 0  # asked for; 0 for those of the automatic rule
     nterms: int = 1  # images that are solved for together
     outliers: tuple[tuple[int, int], ...] = ()  # shapes of small images beside this one
-    stokes: int = 1  # Stokes parameters that are solved side by side
+    stokes: int = 1  # Stokes parameters
+    together: int = 1  # of these, as many as are solved side by side
 
     @classmethod
     def of(cls, volume, grid, options, report=False, band=0.0, ranks=ALONE):
@@ -104,6 +105,7 @@ class Workload:
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2,
                    averages=options.averages and not grid.is_mosaic, nterms=grid.nterms, stokes=len(grid.stokes),
+                   together=max(1, len(grid.stokes) - 1) if options.polbound and grid.stokes[0] == "I" else 1,
                    outliers=grid.shapes[1:])
 
     def memory(self):
@@ -115,11 +117,12 @@ class Workload:
         return self._of_cube() if self.channels else self._of_plane()
 
     def _of_stokes(self):
-        """The phases of several Stokes parameters, of which each has all that one alone has of its own."""
+        """The phases of several Stokes parameters: those solved side by side have all that one alone has of its own."""
         shared = ("libraries", "visibilities", "while reading", "uv grid", "while planning", "wavelet workspace")
-        further = {"further Stokes parameters": STOKES * (self.stokes - 1) * self.samples}
-        return {phase: {part: size * (1 if part in shared else self.stokes) for part, size in parts.items()} | further
-                for phase, parts in replace(self, stokes=1).memory().items()}
+        further = {"further Stokes parameters": STOKES * (self.stokes - 1) * self.samples,
+                   "their models and residuals": self._planes(2 * self.stokes + 2)}
+        return {phase: {part: size * (1 if part in shared else self.together) for part, size in parts.items()} | further
+                for phase, parts in replace(self, stokes=1, together=1).memory().items()}
 
     def _of_cube(self):
         """The phases of the fullest channel, beside all data and the cubes; all is read and written at once."""

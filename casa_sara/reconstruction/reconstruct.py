@@ -20,7 +20,7 @@ from casa_sara.reconstruction.paper_method import PAPER
 from casa_sara.reconstruction.problem import Problem, Samples, averaging_cell
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import check_l2bound, operator_accuracy, schedule_of
-from casa_sara.reconstruction.solution import Solution, begin, begin_draws, resume
+from casa_sara.reconstruction.solution import begin, begin_draws, resume
 from casa_sara.reconstruction.state_file import digest, digest_on_disk
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.dabbech2018 import run_paper_algorithm_2
@@ -56,8 +56,6 @@ class Control:
         each, and after every one.
     then : callable, optional
         Called at the end with the iteration, its bounds and its record, all as the solution has left them.
-    begun : callable
-        Called with the `Solution` before its first iteration, or once it has been resumed.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
@@ -66,7 +64,6 @@ class Control:
     tell: Callable[[str], None] = lambda line: None
     drawn: Callable[[str, Draws], None] = lambda name, draws: None
     then: Callable[[AdaptivePPD, Any, SolverRecord], None] | None = None
-    begun: Callable[[Solution], None] = lambda solution: None
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -141,7 +138,6 @@ def reconstruction_steps(samples: Samples, grid: ImageGrid, options: SolverOptio
         solution = begin(samples, problem_of, options, startmodel, control.stopped, ranks)
         if control.stopped():
             control = replace(control, checkpoint=None)
-    control.begun(solution)
     sides = averaging_cell(grid)
     averaging = _averaging(solution, sides)
     control.tell(_averaging_words(solution.ppd, averaging, options, grid, sides))

@@ -366,25 +366,6 @@ class AdaptivePPD:
         change, norm, self.model_flux, self.model_max = sums
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
 
-    def unprojected(self, out: np.ndarray) -> np.ndarray:
-        """Return z − τ(ηΦ†v + ζΨu), what Step 17 has projected: of the last step, in one process.
-
-        Parameters
-        ----------
-        out : real (nx, ny)
-            Receives the result.
-
-        Returns
-        -------
-        real (nx, ny)
-        """
-        real = self.model.dtype.type
-        np.multiply(self._data_gradient, real(self.l2_step), out=out)
-        out += self._prior_gradient
-        out *= real(-self.tau)
-        out += self.anchor
-        return out
-
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.
 

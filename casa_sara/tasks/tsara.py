@@ -146,8 +146,8 @@ class _tsara:
         positivity=False. As in tclean, a sample with any correlation flagged is not used. Where the
         weight of one parallel-hand correlation is 0, negative or NaN, I alone is taken from the other
         one; of several Stokes parameters such a sample is not used.
-        Several are read once and solved side by side, each with its own noise levels and weights of the
-        prior; they are the planes of each product, as tclean writes them. Not available for several:
+        Several are read once, and solved each with its own noise levels and weights of the prior; they
+        are the planes of each product, as tclean writes them. Not available for several:
         specmode='cube', gridder='mosaic', method='dabbech2018', nterms, sdimage, ndraws, jackknife,
         savemodel, report and parallel.
         Examples: stokes='IQUV'
@@ -471,8 +471,11 @@ class _tsara:
 
     polbound : bool, default False
         Only used where stokes has I and others. True allows no pixel of the models more polarised
-        intensity than total intensity, sqrt(Q^2 + U^2 + V^2) at most I; I, Q, U and V are then solved
-        for together.
+        intensity than total intensity, sqrt(Q^2 + U^2 + V^2) at most I: Q, U and V are solved for
+        together, after I, which stays what it is alone. Less noise is then taken for polarisation, above
+        all where I is nothing. It is wrong where the array does not see the brightness to which the
+        polarisation belongs, as that of a foreground or of a source larger than its shortest baseline
+        measures: what is polarised there is lost, and the log warns that the residual is not noise.
 
     precondition : bool, default True
         True scales the steps of the solver by the density of the uv coverage (preconditioning), so
