@@ -254,14 +254,14 @@ def read_data(request, ranks, scratch):
     data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks, scratch)
     data.notes.extend(check_pointings(data, grid))
     if grid.is_mosaic:
-        data, grid = with_beams(data, request.selection, grid)
+        data, grid = with_beams(data, request.selection, grid, comm)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
     grid = with_turns(grid, data)
     outliers = outlier_planes(request, data, grid)
     if grid.is_mosaic:
         weights = imaging_weights(data, grid, request.weighting, comm)
-        plane = plane.of_mosaic(weight_image(data, grid, weights), output.pblimit)
+        plane = plane.of_mosaic(weight_image(data, grid, weights, comm), output.pblimit)
     dish = total_power(request.single_dish, data, plane, grid)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
@@ -349,7 +349,9 @@ def _write(request, plane, images, solution, record, child):
     """Write the products, with the errors that the draws give."""
     reconstruction = solution.reconstruction
     draws, jackknife = seen_draws(reconstruction, plane.grid) if reconstruction else (None, None)
-    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
+    weight = images.pixels.get("weight")
+    pb = None if weight is None else np.sqrt(weight / weight.max())
+    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad, pb)
     if "model.error" in errors:
         errors["draws"] = draws.arrays()
     if reconstruction and reconstruction.spectra is not None:

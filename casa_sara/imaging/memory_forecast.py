@@ -29,6 +29,7 @@ SOLVER = 48  # whitened data, density, preconditioner, dual, Φx̄, Φz, weights
 PASSING = 12  # weights of a pass between the iterations
 # where visibilities are averaged; the averages have an operator of their own
 AVERAGED = 16  # of all: whitened, the numbers of their cells, the density
+PARTS = 28  # of all, of a mosaic: place and phase in the part of the image that it sees
 AVERAGE = 72  # of an average: that of SOLVER, POINT and the sums of its cell
 RENEWING = 24  # of all: residual and its sums
 # samples on the disk: of each, of each of the largest block, and of each of a piece that is worked on
@@ -104,7 +105,7 @@ class Workload:
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2,
-                   averages=options.averages and not grid.is_mosaic, nterms=grid.nterms, stokes=len(grid.stokes),
+                   averages=options.averages, nterms=grid.nterms, stokes=len(grid.stokes),
                    together=max(1, len(grid.stokes) - 1) if options.polbound and grid.stokes[0] == "I" else 1,
                    outliers=grid.shapes[1:])
 
@@ -209,7 +210,8 @@ class Workload:
         if not self.averages:
             return {"solver's visibilities": SOLVER * self.samples}
         most = math.ceil(WORTHWHILE * self.samples)
-        return {"solver's visibilities": AVERAGED * self.samples + AVERAGE * most + self._grid()
+        of_each = AVERAGED + PARTS * (self.gridder == "mosaic")
+        return {"solver's visibilities": of_each * self.samples + AVERAGE * most + self._grid()
                 + further_bytes(most, self, self.max_w, self.band) + self._spectra(most) + self._elsewhere(most)}
 
     def _writing(self, with_operator):

@@ -11,7 +11,6 @@ from casa_sara.casa.images.sky_image import beam_numbers
 from casa_sara.casa.images.spectral_index import reference_hz
 from casa_sara.casa.runtime import log
 from casa_sara.operators.subbands import Subbands
-from casa_sara.reconstruction.draws import FEWEST as FEWEST_DRAWS
 
 __all__ = ["LARGEST_ERROR", "divided_by_band", "seen_draws", "spectral_images", "spectral_index", "with_subbands"]
 
@@ -115,20 +114,11 @@ def spectral_images(found, grid, data, beam):
     """
     *axes, angle = beam_numbers(beam)
     cell = tuple(size / ARCSEC for size in grid.cell_rad)
-
-    def smoothed(spectra):
-        return beam_pixels(axes, cell) * np.array([smooth(plane, axes, angle, cell) for plane in spectra])
-
-    seen = smoothed(found.spectra)
+    seen = beam_pixels(axes, cell) * np.array([smooth(plane, axes, angle, cell) for plane in found.spectra])
     noise = found.noise_jy_per_beam
     if grid.is_mosaic:
         noise = noise * _noise_of_sky(grid, data)
     index, error, known = spectral_index(seen, grid.subbands, noise)
-    if found.draws is not None and len(found.draws) >= FEWEST_DRAWS:
-        change = index_change(seen, grid.subbands, noise, known)
-        error = found.draws.error(lambda difference: change(smoothed(grid.subbands.spectra(difference))))
-        known &= error <= LARGEST_ERROR
-        index, error = (np.where(known, image, np.float32(0)) for image in (index, error))
     return {"alpha": index, "alpha.error": error, "known": known, "subbands": found.spectra,
             "freqs_hz": grid.subbands.freqs_hz}
 
@@ -166,36 +156,21 @@ def spectral_index(seen, subbands, noise):
     known : bool (nx, ny)
         Where the brightness is positive, and the error at most `LARGEST_ERROR`.
     """
+    place = np.log(subbands.freqs_hz / subbands.reference_hz)[:, None, None]
     good = ((seen > 0) & np.isfinite(noise)).all(axis=0)
     brightness = np.where(good, seen, 1.0)
-    factors, spread = _fit(brightness, good, subbands, noise)
-    index = (factors * np.log(brightness)).sum(axis=0) / spread
+    weight = np.where(good, subbands.shares[:, None, None] * (brightness / noise) ** 2, 1.0)
+    total = weight.sum(axis=0)
+    offset = place - (weight * place).sum(axis=0) / total
+    spread = (weight * offset**2).sum(axis=0)
+    index = (weight * offset * np.log(brightness)).sum(axis=0) / spread
     error = spread**-0.5
     known = good & (error <= LARGEST_ERROR)
     return *(np.where(known, image, 0).astype(np.float32) for image in (index, error)), known
 
 
-def _fit(brightness, good, subbands, noise):
-    """Return factors (T, nx, ny) and a divisor (nx, ny) with which logarithms of the brightness give the index."""
-    place = np.log(subbands.freqs_hz / subbands.reference_hz)[:, None, None]
-    weight = np.where(good, subbands.shares[:, None, None] * (brightness / noise) ** 2, 1.0)
-    offset = place - (weight * place).sum(axis=0) / weight.sum(axis=0)
-    return weight * offset, (weight * offset**2).sum(axis=0)
-
-
-def index_change(seen, subbands, noise, known):
-    """Return what gives the change of the index, (nx, ny), for a small one of the brightness, (T, nx, ny).
-
-    Parameters are those of :func:`spectral_index`, which has found where the index is `known`.
-    """
-    brightness = np.where(known, seen, 1.0)
-    factors, spread = _fit(brightness, known, subbands, noise)
-    per_brightness = np.where(known, factors / (spread * brightness), 0)
-    return lambda change: (per_brightness * change).sum(axis=0)
-
-
 def seen_draws(found, grid):
-    """Return the draws of bootstrap and jackknife of a reconstruction, of several frequencies those at the reference."""
+    """Return the draws of bootstrap and jackknife of a reconstruction: of several frequencies, at the reference."""
     drawn = found.draws, found.jackknife
     if grid.subbands is None:
         return drawn

@@ -221,14 +221,9 @@ def _check_errors(parameters):
 
 def _refuse_for_mosaics(parameters):
     """Raise on parameters that mosaics do not have."""
-    if parameters["gridder"] != "mosaic":
-        return
-    for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
-                                ("parallel", False, "a mosaic takes one process"),
-                                ("ndraws", 0, "errors by bootstrap are of single pointings only"),
-                                ("jackknife", False, "errors by jackknife are of single pointings only")):
-        if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
+    mode = parameters["specmode"]
+    if parameters["gridder"] == "mosaic" and mode != "mfs":
+        raise ValueError(f"specmode = {mode!r} with gridder = 'mosaic': mosaics are continuum images; should be 'mfs'")
 
 
 def _check_single_dish(parameters):
@@ -261,10 +256,6 @@ def _refuse_for_spectra(parameters):
     if parameters["gridder"] == "wproject":
         raise ValueError(f"gridder = 'wproject' with nterms = {nterms}: the w-term is modelled of flat, or of known "
                          "spectra; should be 'standard' or 'mosaic'")
-    if parameters["gridder"] == "mosaic" and (parameters["ndraws"] or parameters["jackknife"]):
-        raise ValueError(f"ndraws = {parameters['ndraws']}, jackknife = {parameters['jackknife']} with nterms = "
-                         f"{nterms} and gridder = 'mosaic': errors of spectra are of single pointings; should be 0 "
-                         "and False")
     for name, right, reason in (("method", "tsara", "the paper's method has one image"),
                                 ("stokes", "I", "spectra are those of the brightness"),
                                 ("positivity", True, "the brightness is positive at all frequencies"),

@@ -97,8 +97,8 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     ------
     ValueError
         Noise levels that are neither one for all blocks nor one for each; too few blocks for a jackknife; errors
-        asked for of a mosaic, or with the paper's method; total power with errors, with bounds that do not adapt, or
-        on several ranks; outliers with errors, with the paper's method, or on several ranks.
+        asked for with the paper's method; total power with errors, with bounds that do not adapt, or on several ranks;
+        outliers with errors, with the paper's method, or on several ranks.
     CheckpointError
         The state that was read is not one of these data.
     """
@@ -172,10 +172,9 @@ def _check(options, grid, samples, comm):
         _check_outliers(options, comm)
     if options.jackknife:
         jackknife_groups(blocks)
-    if (options.ndraws or options.jackknife) and (grid.mosaic is not None or options.method == PAPER):
-        what = "gridder = 'mosaic'" if grid.mosaic is not None else f"method = '{PAPER}'"
+    if (options.ndraws or options.jackknife) and options.method == PAPER:
         raise ValueError(f"ndraws = {options.ndraws}, jackknife = {options.jackknife}: should be 0 and False with "
-                         f"{what}, which has no errors of the model")
+                         f"method = '{PAPER}', which has no errors of the model")
 
 
 def _check_total_power(options, comm):
@@ -208,6 +207,7 @@ def _averaging(solution, sides):
 def _averaging_words(ppd, averaging, options, grid, sides):
     """Return the line of the log on it."""
     cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
+    within = "block" if grid.mosaic is None else "block, pointing and kind of baseline"
     if averaging:
         smaller = 2 ** max(averaging["halvings"])
         finer = f", or up to {smaller} times smaller" if smaller > 1 else ""
@@ -215,12 +215,10 @@ def _averaging_words(ppd, averaging, options, grid, sides):
         cell = f"uv cells of {u:.4g} x {v:.4g} wavelengths"
         count = ppd.samples[:len(averaging["halvings"])].sum()
         return (f"{count} visibilities are averaged to {averaging['averages']} for the solver, within each "
-                f"block and {cell}{finer}; for the first image the averages are wrong by up to "
+                f"{within} and {cell}{finer}; for the first image the averages are wrong by up to "
                 f"{averaging['largest_error']:.2g} of their noise, which is corrected at every re-weighting")
     if not options.averages:
         return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"
-    if grid.mosaic is not None:
-        return "visibilities are not averaged: gridder = 'mosaic'"
     return f"visibilities are not averaged: {cell} would leave more than half as many"
 
 
@@ -228,6 +226,10 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     """Tell the checkpoint, on rank 0, of what data the solution is: digests of all that it depends on."""
     data = samples.data
     gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=samples.density)
+    beams = None
+    if grid.mosaic is not None:
+        gathered["beam"] = np.asarray(data.beam)
+        beams = np.array([[*one.centre, one.radius_rad, *one.profile] for one in grid.mosaic.beams], np.float32)
     digests: dict[str, str | None] = {
         name: digest(whole) for name, array in gathered.items() if not data.scratch.on_disk
         and (whole := layout.gather(np.ascontiguousarray(array))) is not None}
@@ -237,7 +239,7 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     subbands = grid.subbands and grid.subbands.freqs_hz
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
         blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex, subbands=subbands,
-        sensitivity=grid.mosaic and grid.mosaic.over,
+        beams=beams,
         sdimage=samples.total_power and samples.total_power.values).items()}
     comm.once(checkpoint.identify, **digests)
 

@@ -231,9 +231,8 @@ class _tsara:
         spectra are, as in tclean, those of the sky as seen by the antennas, whose primary beam
         becomes narrower with frequency: beyond the middle of the field .alpha is steeper than that
         of the sky. With gridder='mosaic', for one pointing too, they are those of the sky: the
-        primary beams of every frequency are in the model. With ndraws .alpha.error is that of the
-        draws. Not with gridder='wproject', spectralindex, parallel, and with gridder='mosaic'
-        neither with ndraws and jackknife.
+        primary beams of every frequency are in the model. Images of errors by ndraws and jackknife
+        are at reffreq. Not with gridder='wproject', spectralindex, parallel.
         Example: nterms=3
 
     nchan : int, default -1
@@ -309,8 +308,8 @@ class _tsara:
         same noise everywhere, as tclean's with normtype='flatnoise'; .image.pbcor and .model.pbcor are the
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
-        The model is zero where .pb is below 0.1. The visibilities of a mosaic are not averaged. Not available
-        with 'mosaic': specmode='cube', parallel=True, ndraws and jackknife.
+        The model is zero where .pb is below 0.1. .model.error is that of the sky, .image.error of the sky
+        times .pb. Not available with 'mosaic': specmode='cube'.
 
     onepointing : bool, default False
         Opened by gridder = 'standard' or 'wproject'.
