@@ -87,11 +87,11 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     if area is not None:
         models = {name: model * area for name, model in models.items()}
         truth = truth if truth is None else truth * area
-        _check_regions(regions, area)
+        regions = _within(regions, area)
     # measure
     products = tuple(product_of(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec, primary_beams)
                      for one in sets)
-    products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec),
+    products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec, area),
                              features=_tested(one, features.get(one.name), of_features, plane, repeat))
                      for product, one in zip(products, sets))
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
@@ -168,12 +168,14 @@ def read_products(request, fewest, **options):
     return sets
 
 
-def _check_regions(regions, area):
-    """Raise where a region has nothing of what is compared of mosaics."""
-    for name, mask in regions.items():
-        if not (mask & area).any():
+def _within(regions, area):
+    """Return the regions within what is compared of mosaics; raise where one of them has nothing there."""
+    inside = {name: mask & area for name, mask in regions.items()}
+    for name, mask in inside.items():
+        if not mask.any():
             raise ValueError(f"regions: '{name}' lies where the primary beam of the mosaic is too low to compare: "
                              "should be within the mosaic")
+    return inside
 
 
 def _on_grid(image, plane, first, parameter, notes):
@@ -242,7 +244,7 @@ def _tested(one, features, masks, plane, repeat):
     return tested
 
 
-def _errors(one, plane, regions, beams, cell_arcsec):
+def _errors(one, plane, regions, beams, cell_arcsec, area):
     """Return the errors that a product's draws give: of the model, of the smoothed model and of regions."""
     if not one.draws:
         return {}
@@ -253,7 +255,8 @@ def _errors(one, plane, regions, beams, cell_arcsec):
                          f"{width} x {height}: should be of one run of tsara")
 
     def on_plane(difference):
-        return replace(one.model, pixels=difference).flux_on(plane)
+        flux = replace(one.model, pixels=difference).flux_on(plane)
+        return flux if area is None else flux * area
 
     def fluxes(difference):
         flux = on_plane(difference)

@@ -23,7 +23,15 @@ from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.runtime.deadline import Deadline
 from casa_sara.runtime.signals import stop_on_interrupt
-from casa_sara.solver.record import CONVERGED, EMPTY_MASK, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, UNFINISHED
+from casa_sara.solver.record import (
+    CONVERGED,
+    EMPTY_MASK,
+    ITERATION_LIMIT,
+    NOISE_ONLY,
+    STOPPED_BY_USER,
+    TIME_LIMIT,
+    UNFINISHED,
+)
 
 __all__ = ["CubeResult", "make_cube"]
 
@@ -78,7 +86,8 @@ def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | No
         data = comm.together(read_visibilities, request.selection, grid.phasecenter, grid.stokes)
     data.notes.extend(check_pointings(data, grid) + image_limits(data, grid))
     cube = CubePlanes.of(request, data, forecast.workload.channels, comm)
-    comm.once(check_imagename, output.imagename, cube.plane.pb.shape, 2 * output.pbcor + grid.masked)
+    comm.once(check_imagename, output.imagename, cube.plane.pb.shape, 2 * output.pbcor + grid.masked
+              + 2 * bool(request.options.ndraws) + request.options.jackknife)
     for note in data.notes:
         log.warn(note)
     # the dirty cube: errors of weights and beams are raised before the long part
@@ -144,6 +153,11 @@ def _solve_own(cube, own, checkpoint, watch, pressed):
             code = reconstruction.record.stop_code
             if code in UNFINISHED:
                 code = reconstruction.record.stop_code = watch.asked() or code
+            elif not reconstruction.finished:  # all but its draws
+                code = watch.asked() or (STOPPED_BY_USER if pressed() else TIME_LIMIT)
+            else:
+                code = 0
+            if code:
                 cube.take(k, reconstruction)
                 if not of_channel.kept:
                     checkpoint.keep(-1, lambda: None, 0, now=True)

@@ -14,14 +14,16 @@ from casa_sara.casa.runtime import log
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.imaging.continuum import Result, describe, split
 from casa_sara.imaging.data_quality import check_confined, left_outside, nowhere_visible, thermal_noise
+from casa_sara.imaging.error_images import error_images
 from casa_sara.imaging.island_list import list_islands
 from casa_sara.imaging.plane_images import plane_images
-from casa_sara.imaging.run_solver import Watch, density_of, solve_image, without_wild
+from casa_sara.imaging.run_solver import Watch, density_of, expected_iterations, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace
 from casa_sara.options import ImagingRequest
 from casa_sara.parallel.serial import SERIAL
+from casa_sara.reconstruction.bootstrap import jackknife_groups
 from casa_sara.reconstruction.problem import Samples
-from casa_sara.reconstruction.settings import check_l2bound, schedule_of
+from casa_sara.reconstruction.settings import check_l2bound
 
 __all__ = ["Channel", "CubePlanes", "Tally"]
 
@@ -96,7 +98,8 @@ class CubePlanes:
             numbers = ", ".join(map(str, np.flatnonzero(closed & ~blank)))
             data.notes.append(f"the mask is empty in channels {numbers}: their models are zero")
         channels = [Channel(float(freq), closed=bool(shut)) for freq, shut in zip(axis.freqs_hz, closed)]
-        images = {name: np.zeros(plane.pb.shape, np.float32) for name in ("psf", "residual", "model")}
+        names = () if request.output.images_stand else _error_names(request)
+        images = {name: np.zeros(plane.pb.shape, np.float32) for name in ("psf", "residual", "model", *names)}
         return cls(request, data, plane, axis, order, first, channels, support, images)
 
     @property
@@ -121,6 +124,8 @@ class CubePlanes:
             part = self._split(k)
             describe(part.data, part.blocks, part.noise, self.request.grid.stokes)
             check_l2bound(self.request.options, len(part.blocks))
+            if self.request.options.jackknife:
+                jackknife_groups(len(part.blocks))
             self._fill(k, part.data, part.blocks, part.noise, None, model)
         except ValueError as error:
             raise ValueError(f"channel {k}, {self.channels[k].freq_hz / 1e9:.9g} GHz: {error}") from error
@@ -131,7 +136,7 @@ class CubePlanes:
         part, request = self._split(k), self.request
         density = density_of(part.data, None, request.grid, request.options)
         samples = Samples(part.data, part.offsets, density, part.noise)
-        watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations), checkpoint)
+        watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
         start, support = self._startmodel(k), None if self.support is None else self.support[k]
         if start is not None and support is not None:
             start *= support
@@ -143,6 +148,10 @@ class CubePlanes:
         list_islands(reconstruction.record, self.plane, request.grid.cell_rad, request.options.significance)
         data, blocks = without_wild(part.data, part.blocks, part.offsets, reconstruction)
         weights = self._fill(k, data, blocks, part.noise, reconstruction, reconstruction.model)
+        errors = error_images(reconstruction.draws, reconstruction.jackknife, self.channels[k].beam,
+                              request.output.restoringbeam, request.grid.cell_rad)
+        for name, image in errors.items():
+            self.images[name][k] = image
         if self.support is not None:
             check_confined(reconstruction.model, self.support[k])
             sigma = thermal_noise(data, weights, part.noise, np.searchsorted(reconstruction.kept, part.offsets))
@@ -202,3 +211,10 @@ class CubePlanes:
         channel.result = Result(Tally(data.size, data.dropped), data.size, blocks, noise, reconstruction,
                                 found.residual_peak, found.model_flux, {})
         return found.weights
+
+
+def _error_names(request):
+    """Return the names of the images of errors that were asked for."""
+    options, restored = request.options, request.output.restoringbeam is not None
+    return ["model.error"] * bool(options.ndraws) + ["image.error"] * (bool(options.ndraws) and restored) + [
+        "image.jackknife"] * (options.jackknife and restored)

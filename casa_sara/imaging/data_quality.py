@@ -203,7 +203,7 @@ def image_limits(data, grid, comm=SERIAL):
                      f"{FEWEST_PIXELS:g} sources between pixels cannot be represented; 5 would be cell = "
                      f"'{arcsec * pixels / 5:.3g}arcsec'")
     if grid.is_mosaic:
-        return notes + w_note(data, grid.mosaic, LARGEST_W_PHASE)
+        return notes + w_note(max_w, grid.mosaic, LARGEST_W_PHASE)
     corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
     phase = np.pi * max_w * corner_sq
     if phase > LARGEST_W_PHASE and grid.gridder == "standard":

@@ -182,7 +182,8 @@ def _write_errors(root, plane, images, beam, output):
     if "model.error" in images:
         write_image(root + ".model.error", images["model.error"], plane, unit="Jy/pixel")
     for name in {"image.error", "image.jackknife"} & images.keys():
-        restored = restored_beam(list(output.restoringbeam), beam)
+        words = list(output.restoringbeam)
+        restored = [restored_beam(words, one) for one in beam] if isinstance(beam, list) else restored_beam(words, beam)
         write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored, masked=plane.masks_all)
 
 
