@@ -37,7 +37,7 @@ SUPER_RESOLUTION = 1.7
 STOKES = "IQUV"
 MOST_POLARISED, TURNS, CIRCULAR = 0.6, 2.0, 0.01
 SHORT_SCALES, LONG_SCALES = (0, 0.6, 1.8, 5.4), (0, 0.6, 1.8, 5.4, 16)
-GRID = {"4000": (SHORT_SCALES, 4000, 2.0), "20000": (SHORT_SCALES, 20_000, 2.0), "long": (LONG_SCALES, 20_000, 2.0),
+GRID = {"short": (SHORT_SCALES, 20_000, 2.0), "long": (LONG_SCALES, 20_000, 2.0),
         "deep": (LONG_SCALES, 20_000, 1.0)}  # scales in units of the beam, most iterations, nsigma
 CIRCULAR_FEEDS, LINEAR_FEEDS = "RR RL LR LL", "XX XY YX YY"
 

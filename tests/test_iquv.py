@@ -1,6 +1,7 @@
 """Several Stokes parameters of one image: against tclean's images of them, and against images of each alone."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from test_visibilities import observation
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import tsara
+from casa_sara import saracompare, tsara
+from casa_sara.analysis.comparison import Product
+from casa_sara.analysis.polarisation import polarised_measures
 from casa_sara.casa.images.image_plane import read_planes
 from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.runtime.tools import opened
@@ -99,6 +102,8 @@ def test_without_the_bound_each_is_what_it_is_alone(observed):
 
 @pytest.mark.slow
 def test_no_pixel_is_polarised_beyond_its_brightness(observed):
+    import casatasks
+
     given = dict(vis=observed["linear"], stokes="IQUV", polbound=True, mask="box[[10pix,10pix],[70pix,64pix]]") | GRID
     result = tsara(imagename="x", **given)
     model, *_ = planes("x.model")
@@ -115,6 +120,15 @@ def test_no_pixel_is_polarised_beyond_its_brightness(observed):
     assert [island["right_ascension"][:8] for island in result["sara"]["stokes"][0]["islands"][:2]]
     with open("x.sara.json") as record:
         assert json.load(record)["stokes"][3]["stokes"] == "V"
+    # tclean's beside it: the same intensity and angle where it is bright
+    theirs = {name: value for name, value in given.items() if name not in ("nthreads", "polbound")}
+    casatasks.tclean(imagename="c", niter=300, **theirs)
+    measures = saracompare(models=["x", "c"], outdir="report")["products"]
+    found = measures["x"]["polarisation"]
+    assert found["peak_jy_per_beam"] == pytest.approx(np.hypot(SKY["Q"], SKY["U"]).max(), rel=0.05)
+    assert 0.3 < found["fraction"] < 0.5 and "snr" not in found
+    assert measures["c"]["polarisation"]["snr"] > 20 and measures["c"]["polarisation"]["angle_rms_deg"] < 2
+    assert measures["x"]["natural"]["sigma"] > 0 and os.path.getsize("report/polarisation.png") > 20_000
     # a restart goes on from the models of all
     again = tsara(imagename="x", restart=True, niter=0, **given)
     for entry, plane in zip(again["sara"]["stokes"], model):
@@ -207,3 +221,26 @@ def test_the_bound_leaves_brightness_as_it_is_and_confines_its_polarisation():
     area = np.s_[10:27, 22:39]
     fluxes = [np.hypot(*(found[stokes].model[area].sum() for stokes in "QU")) for found in (together, alone)]
     assert fluxes[0] < together["I"].model[area].sum() < fluxes[1]
+
+
+def test_polarised_intensity_and_angle_are_measured_against_a_reference():
+    """A source turned by 10 degrees and 20 % fainter; noise alone tells the level."""
+    x, y = np.mgrid[-32:32, -32:32]
+    source = np.exp(-(x**2 + y**2) / 50) + 0j
+    rng, beams = np.random.default_rng(4), {"natural": (3.0, 3.0, 0.0)}
+    residual = {"natural": 0.01 * rng.standard_normal((64, 64))}
+    turned = 0.8 * source * np.exp(2j * np.radians(10))
+    products = [Product("one", 2 * source.real, residual, residual, polarised=source * np.exp(0.3j)),
+                Product("without", source.real, residual, residual),
+                Product("other", 2 * source.real, residual, residual, polarised=turned * np.exp(0.3j))]
+    found = polarised_measures(products, (1.0, 1.0), beams)
+    assert found.keys() == {"one", "other"} and "snr" not in found["one"]
+    assert found["other"]["angle_rms_deg"] == pytest.approx(10, rel=1e-6)
+    assert [found[name]["fraction"] for name in found] == pytest.approx([0.5, 0.4], rel=1e-6)
+    assert found["other"]["snr"] == pytest.approx(-20 * np.log10(abs(1 - 0.8 * np.exp(2j * np.radians(10)))), rel=1e-6)
+    area = np.pi * 9 / (4 * np.log(2))
+    assert found["one"]["level_jy_per_beam"] == pytest.approx(0.1, rel=0.05)
+    assert 0.8 * area < found["one"]["peak_jy_per_beam"] < area
+    against = polarised_measures(products, (1.0, 1.0), beams, source)
+    assert against["one"]["angle_rms_deg"] == pytest.approx(np.degrees(0.15), rel=1e-6)
+    assert polarised_measures(products[1:2], (1.0, 1.0), beams) == {}

@@ -13,8 +13,9 @@ from casa_sara.analysis import metrics
 from casa_sara.analysis.areas import Frame, places, region_masks
 from casa_sara.analysis.comparison import Comparison, Product
 from casa_sara.analysis.measuring import measure, source_support
+from casa_sara.analysis.polarisation import polarised_measures
 from casa_sara.casa.images.fits_files import is_fits
-from casa_sara.casa.images.image_sets import check_same_data, data_names, read_frames, read_image_set
+from casa_sara.casa.images.image_sets import check_same_data, data_names, read_frames, read_image_set, read_polarised
 from casa_sara.casa.images.sky_image import read_sky_image
 from casa_sara.casa.runtime import log
 from casa_sara.comparison.features import measures_of, test_features
@@ -92,16 +93,20 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     products = tuple(product_of(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec, primary_beams)
                      for one in sets)
     products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec, area),
+                             polarised=_polarised(one.polarised, plane),
                              features=_tested(one, features.get(one.name), of_features, plane, repeat))
                      for product, one in zip(products, sets))
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
+    polarised_truth = _polarised(read_polarised(request.truth, "truth"), plane) if request.truth else None
+    for name, entry in polarised_measures(products, frame.cell_arcsec, beams, polarised_truth).items():
+        measures["products"][name]["polarisation"] = entry
     if injected:
         _inject(injected, plane, request, selection, sets, beams, measures["products"])
     for note in notes:
         log.warn(note)
     return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures,
-                      versions(), tuple(notes), frames)
+                      versions(), tuple(notes), frames, polarised_truth)
 
 
 def versions():
@@ -222,6 +227,11 @@ def product_of(one, model, residuals, beams, cell_arcsec, primary_beams=None):
         restored[weighting] = smoothed + of_product[weighting]
     return Product(one.name, model, of_product, restored, dict(one.parameters), dict(one.record),
                    primary_beams=primary_beams or {})
+
+
+def _polarised(images, plane):
+    """Return Q + iU on the common grid, complex (nx, ny) in Jy/pixel, None where there are none."""
+    return images["Q"].flux_on(plane) + 1j * images["U"].flux_on(plane) if images else None
 
 
 def _features(request, sets, observed):
