@@ -2,6 +2,7 @@
 
     python benchmarks/outlier.py FOLDER            # VLA B at 1.4 GHz, M31 of 0.2 Jy, a double of 2 Jy 0.7 degrees away
     python benchmarks/outlier.py FOLDER --case D   # VLA D, 2 degrees away, with the w-term
+    python benchmarks/outlier.py FOLDER --seeds 4  # of the noise: what the outlier file loses, tsara alone
     python benchmarks/outlier.py FOLDER --time     # an iteration with and without an outlier
 
 Two observations with the same noise: of the field alone, and with the double beside it, whose sidelobes cover the
@@ -110,7 +111,7 @@ def predicted(uvw, flux, *s):
     return np.exp(2j * np.pi * (s[:, 0] - [0, 0, 1]) @ uvw) * transform(uvw, near + [[0], [0], [1]], flux)
 
 
-def observe(folder, case, sources):
+def observe(folder, case, sources, seed=0):
     """Write the two MeasurementSets unless they are there; return their names."""
     from simulated_ms import column, edit, simulate
 
@@ -121,7 +122,7 @@ def observe(folder, case, sources):
             continue
         simulate(path, configuration=case.configuration, antennas=27, spws=(("1.4GHz", "2MHz", 3),), scans=8,
                  scan_seconds=8 * case.integration, integration=case.integration, spacing_seconds=2700, hour_angle=-3.0,
-                 sky=((0.0, 0.0, 0.0),), noise=NOISE)
+                 sky=((0.0, 0.0, 0.0),), noise=NOISE, seed=seed)
         freqs, uvw = column(path + "/SPECTRAL_WINDOW", "CHAN_FREQ")[:, 0], column(path, "UVW")
         vis = np.array([sum(predicted(uvw * freq / SPEED_OF_LIGHT, *part) for part in seen) for freq in freqs])
         edit(path, "DATA", lambda noise, vis=vis: noise + vis)
@@ -223,6 +224,21 @@ def compare(folder, case):
         print(f"| {label} | {half:.1f} | {one:.1f} | {flux:.3f} | {far} | {seconds:.0f} |")
 
 
+def lost(folder, case, seeds):
+    """Print what becomes of the SNR of the field, with the outlier file, for several realisations of the noise."""
+    sky, *sources = the_sky(case)
+    for seed in range(seeds):
+        own, rows = folder / f"seed{seed}", []
+        own.mkdir(exist_ok=True)
+        names = observe(own, case, sources, seed)
+        for name, vis, with_file in (("alone", "alone", False), ("with_file", "both", True)):
+            models, beam, _ = imaged(own, case, names[vis], name, with_file)
+            rows.append(scored(sky, models[0], case, beam) + (list(of_double(models[1])) if with_file else []))
+        print(f"seed {seed}: field alone {rows[0][0]:.2f} and {rows[0][1]:.2f} dB, with the outlier file "
+              f"{rows[1][0] - rows[0][0]:+.2f} and {rows[1][1] - rows[0][1]:+.2f} dB; outlier {rows[1][3]:.4f} of its "
+              f"flux, {rows[1][4]:.4f} pixels off", flush=True)
+
+
 def iteration_time(pixels=1024, outlier=128, samples=200_000):
     """Time an iteration of an image with and without outliers."""
     from casa_sara.operators.dictionary import SaraDictionary
@@ -255,6 +271,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--case", default="B", choices=CASES)
+    parser.add_argument("--seeds", type=int, default=0)
     parser.add_argument("--time", action="store_true")
     args = parser.parse_args()
     if args.time:
@@ -262,7 +279,10 @@ def main():
         return
     folder = args.folder.resolve() / args.case
     folder.mkdir(parents=True, exist_ok=True)
-    compare(folder, CASES[args.case])
+    if args.seeds:
+        lost(folder, CASES[args.case], args.seeds)
+    else:
+        compare(folder, CASES[args.case])
 
 
 if __name__ == "__main__":

@@ -130,7 +130,7 @@ class Workload:
         one = replace(self, samples=math.ceil(self.samples * self.share), channels=0).memory()
         one.pop("reading")
         writing = one.pop("writing")
-        cubes = CUBES + CUBES_OF_ERRORS * bool(self.draws)
+        cubes = CUBES + (self.gridder == "mosaic") + CUBES_OF_ERRORS * bool(self.draws)
         held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
                 "cubes": self._planes((PLANE + cubes + MASK * self.masked) * self.channels)}
         if self.draws:
@@ -255,7 +255,7 @@ class Workload:
 
     def _drawn(self):
         """Bytes of the draws."""
-        return self._planes(DRAW * self.draws * (DRAWN_PART if self.confined else 1.0))
+        return self._planes(DRAW * self.draws * self.nterms * (DRAWN_PART if self.confined else 1.0))
 
     def _side(self):
         cell = min(self.cell_rad)

@@ -221,9 +221,9 @@ def _check_errors(parameters):
 
 def _refuse_for_mosaics(parameters):
     """Raise on parameters that mosaics do not have."""
-    mode = parameters["specmode"]
-    if parameters["gridder"] == "mosaic" and mode != "mfs":
-        raise ValueError(f"specmode = {mode!r} with gridder = 'mosaic': mosaics are continuum images; should be 'mfs'")
+    if parameters["gridder"] == "mosaic" and parameters["specmode"] == "cube" and parameters["report"]:
+        raise ValueError("report = True with gridder = 'mosaic' and specmode = 'cube': reports are made of mosaics of "
+                         "one channel, and of cubes of single pointings; should be False")
 
 
 def _check_single_dish(parameters):
@@ -260,9 +260,7 @@ def _refuse_for_spectra(parameters):
                                 ("stokes", "I", "spectra are those of the brightness"),
                                 ("positivity", True, "the brightness is positive at all frequencies"),
                                 ("spectralindex", "", "either the index is known, or it is solved for"),
-                                ("parallel", False, "spectra take one process"),
-                                ("ndraws", 0, "errors by bootstrap are of one image"),
-                                ("jackknife", False, "errors by jackknife are of one image")):
+                                ("parallel", False, "spectra take one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 

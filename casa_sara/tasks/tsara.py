@@ -231,8 +231,8 @@ class _tsara:
         spectra are, as in tclean, those of the sky as seen by the antennas, whose primary beam
         becomes narrower with frequency: beyond the middle of the field .alpha is steeper than that
         of the sky. With gridder='mosaic', for one pointing too, they are those of the sky: the
-        primary beams of every frequency are in the model. Not with gridder='wproject',
-        spectralindex, ndraws, jackknife, parallel.
+        primary beams of every frequency are in the model. Images of errors by ndraws and jackknife
+        are at reffreq. Not with gridder='wproject', spectralindex, parallel.
         Example: nterms=3
 
     nchan : int, default -1
@@ -309,7 +309,8 @@ class _tsara:
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
         The model is zero where .pb is below 0.1. .model.error is that of the sky, .image.error of the sky
-        times .pb. Not available with 'mosaic': specmode='cube'.
+        times .pb. Of a cube .pb and .weight are those of each channel. Not available for cubes of 'mosaic':
+        report, and saracompare.
 
     onepointing : bool, default False
         Opened by gridder = 'standard' or 'wproject'.
