@@ -49,12 +49,18 @@ GRID = {
     "briggs deep": (SHORT, 0.0, 20_000, "briggs"), "briggs long": (LONG, 0.0, 4000, "briggs"),
     "briggs long deep": (LONG, 0.0, 20_000, "briggs"), "briggs deeper": (SHORT, 0.0, 60_000, "briggs"),
 }  # fmt: skip
-# weighting, robust, threshold in units of the noise, channels of the output
-WSCLEAN = {f"{weighting}{robust:+g} {sigma:g} {channels}".replace("natural+0", "natural"): (
-    weighting, robust, sigma, channels) for weighting, robust, sigma, channels in (
-    ("briggs", 0.0, 1.0, 4), ("briggs", 0.0, 0.5, 4), ("briggs", 0.5, 1.0, 4), ("briggs", 0.5, 0.5, 4),
-    ("natural", 0.0, 1.0, 4), ("natural", 0.0, 0.5, 4), ("briggs", -1.0, 1.0, 4), ("briggs", -1.0, 0.5, 4),
-    ("briggs", 0.0, 0.5, 8))}
+# weighting, robust, threshold in units of the noise, channels of the output, further options
+MASKED = ("-auto-mask", "3")
+WSCLEAN = {
+    "briggs+0 1 4": ("briggs", 0.0, 1.0, 4, MASKED), "briggs+0 0.5 4": ("briggs", 0.0, 0.5, 4, MASKED),
+    "briggs+0.5 1 4": ("briggs", 0.5, 1.0, 4, MASKED), "briggs+0.5 0.5 4": ("briggs", 0.5, 0.5, 4, MASKED),
+    "natural 1 4": ("natural", 0.0, 1.0, 4, MASKED), "natural 0.5 4": ("natural", 0.0, 0.5, 4, MASKED),
+    "briggs-1 1 4": ("briggs", -1.0, 1.0, 4, MASKED), "briggs-1 0.5 4": ("briggs", -1.0, 0.5, 4, MASKED),
+    "briggs+0 0.5 8": ("briggs", 0.0, 0.5, 8, MASKED), "briggs-1 0.5 8": ("briggs", -1.0, 0.5, 8, MASKED),
+    "briggs-1 1 4 unmasked": ("briggs", -1.0, 1.0, 4, ()), "briggs-1 0.5 4 unmasked": ("briggs", -1.0, 0.5, 4, ()),
+    "briggs-0.5 1 4 unmasked": ("briggs", -0.5, 1.0, 4, ()), "briggs+0 1 4 unmasked": ("briggs", 0.0, 1.0, 4, ()),
+    "briggs-1 0.5 4 slow": ("briggs", -1.0, 0.5, 4, (*MASKED, "-multiscale-gain", "0.05", "-mgain", "0.6")),
+}  # fmt: skip
 TUNED_ON = "S M31"
 
 
@@ -245,12 +251,12 @@ def run_wsclean(name, folder, settings):
     for setting in settings:
         if setting in result:
             continue
-        weighting, robust, sigma, channels = WSCLEAN[setting]
+        weighting, robust, sigma, channels, more = WSCLEAN[setting]
         root = folder / f"wsclean_{setting.replace(' ', '_')}"
         command = ["wsclean", "-j", "1", "-size", *map(str, common["imsize"]), "-scale", f"{cell}asec", "-weight",
                    *([weighting, str(robust)] if weighting == "briggs" else [weighting]), "-multiscale",
                    "-join-channels", "-channels-out", str(channels), "-fit-spectral-pol", "2", "-niter", "1000000",
-                   "-mgain", "0.8", "-auto-mask", "3", "-auto-threshold", str(sigma), "-data-column", "DATA", "-pol",
+                   "-mgain", "0.8", "-auto-threshold", str(sigma), *more, "-data-column", "DATA", "-pol",
                    "I", "-beam-shape", f"{beam[0]}asec", f"{beam[1]}asec", f"{beam[2]}deg",
                    "-no-update-model-required", "-name", str(root), *common["vis"]]
         begin = time.perf_counter()

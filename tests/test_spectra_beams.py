@@ -134,3 +134,15 @@ def test_comparison_sees_the_spectra_through_the_beams(run, vis):
 def test_model_column_has_the_spectra_through_the_beams(run, vis):
     left = np.abs(column(vis, "DATA") - column(vis, "MODEL_DATA")) ** 2 / (2 * column(vis, "SIGMA")[:, None, :] ** 2)
     assert left.mean() < 1.15  # the noise was multiplied by the spectrum, too
+
+
+@pytest.mark.slow
+def test_errors_of_the_sky(run, vis, tmp_path):
+    """Of stacked images of flat noise: larger where the beams have fallen off, by about as much."""
+    name = str(tmp_path / "drawn")
+    result = tsara(vis=vis, imagename=name, nterms=2, ndraws=6, **GRID)
+    np.testing.assert_array_equal(pixels(name + ".model"), pixels(run[1] + ".model"))
+    islands = {(one["x_peak"], one["y_peak"]): one["bootstrap_error_jy"] for one in result["sara"]["islands"]}
+    assert all(islands[place] > 0 for place in SOURCES)
+    noise = result["sara"]["chosen"]["noise_jy_per_beam"]
+    assert 0.2 < islands[48, 48] / noise < 8 and 0.2 < islands[6, 48] / (noise / pixels(name + ".pb")[6, 48]) < 8

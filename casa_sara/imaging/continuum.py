@@ -58,7 +58,7 @@ from casa_sara.imaging.run_solver import (
     solve_image,
     without_wild,
 )
-from casa_sara.imaging.spectra import divided_by_band, spectral_images, with_subbands
+from casa_sara.imaging.spectra import divided_by_band, seen_draws, spectral_images, with_subbands
 from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
 from casa_sara.imaging.total_power import total_power
 from casa_sara.operators.outliers import rotation, stacked
@@ -348,7 +348,7 @@ def _look_back(images, plane, solution, comm):
 def _write(request, plane, images, solution, record, child):
     """Write the products, with the errors that the draws give."""
     reconstruction = solution.reconstruction
-    draws, jackknife = (reconstruction.draws, reconstruction.jackknife) if reconstruction else (None, None)
+    draws, jackknife = seen_draws(reconstruction, plane.grid) if reconstruction else (None, None)
     weight = images.pixels.get("weight")
     pb = None if weight is None else np.sqrt(weight / weight.max())
     errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad, pb)

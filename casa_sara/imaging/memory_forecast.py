@@ -255,7 +255,7 @@ class Workload:
 
     def _drawn(self):
         """Bytes of the draws."""
-        return self._planes(DRAW * self.draws * (DRAWN_PART if self.confined else 1.0))
+        return self._planes(DRAW * self.draws * self.nterms * (DRAWN_PART if self.confined else 1.0))
 
     def _side(self):
         cell = min(self.cell_rad)

@@ -260,9 +260,7 @@ def _refuse_for_spectra(parameters):
                                 ("stokes", "I", "spectra are those of the brightness"),
                                 ("positivity", True, "the brightness is positive at all frequencies"),
                                 ("spectralindex", "", "either the index is known, or it is solved for"),
-                                ("parallel", False, "spectra take one process"),
-                                ("ndraws", 0, "errors by bootstrap are of one image"),
-                                ("jackknife", False, "errors by jackknife are of one image")):
+                                ("parallel", False, "spectra take one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 

@@ -87,7 +87,8 @@ class Bootstrap:
             np.subtract(self.ppd.model, self.model, out=difference)
             difference *= difference.dtype.type(self.ppd.unit_jy * self._factor)
             if self.ppd.sky_over_image is not None:
-                difference *= self.ppd.sky_over_image
+                skies = self.ppd.planes.split(difference)
+                skies *= self.ppd.sky_over_image
             self.draws.add(difference)
             self.done = 0
             progress(self.draws)

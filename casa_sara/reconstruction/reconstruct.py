@@ -263,7 +263,10 @@ def _draw(solution, name, resampling, control, layout, ranks):
     drawn(draws)
     resampling.run(control.stopped, drawn, partial(_keep, solution, control.checkpoint, layout, ranks, None))
     if len(draws) >= FEWEST:
-        add_flux_errors(solution.result.record.islands, resampling.model, draws.flux_errors, ERRORS_OF_ISLANDS[name])
+        planes = solution.ppd.planes
+        seen = draws if planes.n_planes == 1 else draws.seen(planes.difference_at_reference)
+        add_flux_errors(solution.result.record.islands, planes.at_reference(resampling.model), seen.flux_errors,
+                        ERRORS_OF_ISLANDS[name])
     return draws.complete
 
 

@@ -231,8 +231,8 @@ class _tsara:
         spectra are, as in tclean, those of the sky as seen by the antennas, whose primary beam
         becomes narrower with frequency: beyond the middle of the field .alpha is steeper than that
         of the sky. With gridder='mosaic', for one pointing too, they are those of the sky: the
-        primary beams of every frequency are in the model. Not with gridder='wproject',
-        spectralindex, ndraws, jackknife, parallel.
+        primary beams of every frequency are in the model. Images of errors by ndraws and jackknife
+        are at reffreq. Not with gridder='wproject', spectralindex, parallel.
         Example: nterms=3
 
     nchan : int, default -1
