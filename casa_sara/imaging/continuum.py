@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from casa_sara.casa.images.image_files import read_model, read_spectra
-from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, read_pixels
+from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, read_pixels, relative_pb
 from casa_sara.casa.images.masks import read_support
 from casa_sara.casa.images.products import write_images, write_products
 from casa_sara.casa.images.restore import restored_beam
@@ -350,7 +350,7 @@ def _write(request, plane, images, solution, record, child):
     reconstruction = solution.reconstruction
     draws, jackknife = seen_draws(reconstruction, plane.grid) if reconstruction else (None, None)
     weight = images.pixels.get("weight")
-    pb = None if weight is None else np.sqrt(weight / weight.max())
+    pb = None if weight is None else relative_pb(weight)
     errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad, pb)
     if "model.error" in errors:
         errors["draws"] = draws.arrays()

@@ -130,7 +130,7 @@ class Workload:
         one = replace(self, samples=math.ceil(self.samples * self.share), channels=0).memory()
         one.pop("reading")
         writing = one.pop("writing")
-        cubes = CUBES + CUBES_OF_ERRORS * bool(self.draws)
+        cubes = CUBES + (self.gridder == "mosaic") + CUBES_OF_ERRORS * bool(self.draws)
         held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
                 "cubes": self._planes((PLANE + cubes + MASK * self.masked) * self.channels)}
         if self.draws:

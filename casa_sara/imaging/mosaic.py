@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -145,10 +146,13 @@ class MosaicModel:
         Of :func:`beams_record`, as it comes out of JSON.
     accuracy : dict
         `eps` and `nthreads` of the operator.
+    axis : casa_sara.casa.images.spectral_axis.SpectralAxis, optional
+        Of a cube, whose `model` is (nchan, nx, ny).
     """
 
-    def __init__(self, model, grid, selection, phase_center, beams, accuracy):
+    def __init__(self, model, grid, selection, phase_center, beams, accuracy, axis=None):
         self._model, self._grid, self._selection, self._accuracy = model, grid, selection, accuracy
+        self._axis = axis
         fields = {(int(ms), int(field)): direction for ms, field, direction in beams["fields"]}
         self._profiles = Profiles(np.asarray(beams["bands_hz"]), [tuple(kind) for kind in beams["kinds"]],
                                   np.asarray(beams["radii"]), np.asarray(beams["values"]))
@@ -173,7 +177,14 @@ class MosaicModel:
             return vis
         row = np.repeat(np.arange(rows.ms.size), count // rows.ms.size)
         data = Visibilities(vis=vis, weight=np.ones(count), uvw=uvw, row=row, rows=rows, freq_hz=freq_hz, **self._where)
-        return predicted(self._model, data, self._selection, self._grid, self._profiles, **self._accuracy)
+        of = partial(predicted, selection=self._selection, grid=self._grid, profiles=self._profiles, **self._accuracy)
+        if self._axis is None:
+            return of(self._model, data)
+        channel = self._axis.nearest(freq_hz)
+        for k in np.unique(channel[channel >= 0]):
+            here = np.flatnonzero(channel == k)
+            vis[here] = of(self._model[k], data.take(here))
+        return vis
 
 
 def predicted(model, data, selection, grid, profiles, **accuracy):

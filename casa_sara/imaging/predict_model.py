@@ -51,7 +51,7 @@ def write_column(selection, phase_center, shape, cell_rad, gridder, spectrum, nt
         model = grid.subbands.stacked(model)
     accuracy = dict(eps=IMAGE_EPS, nthreads=nthreads)
     if beams is not None:
-        predict = MosaicModel(model, grid, chosen, phase_center, beams, accuracy)
+        predict = MosaicModel(model, grid, chosen, phase_center, beams, accuracy, axis and SpectralAxis(**axis))
         write_model_column(chosen, phase_center, predict, by_row=True)
         return
     plane = partial(_predicted, grid=grid, accuracy=accuracy)

@@ -221,9 +221,9 @@ def _check_errors(parameters):
 
 def _refuse_for_mosaics(parameters):
     """Raise on parameters that mosaics do not have."""
-    mode = parameters["specmode"]
-    if parameters["gridder"] == "mosaic" and mode != "mfs":
-        raise ValueError(f"specmode = {mode!r} with gridder = 'mosaic': mosaics are continuum images; should be 'mfs'")
+    if parameters["gridder"] == "mosaic" and parameters["specmode"] == "cube" and parameters["report"]:
+        raise ValueError("report = True with gridder = 'mosaic' and specmode = 'cube': reports are made of mosaics of "
+                         "one channel, and of cubes of single pointings; should be False")
 
 
 def _check_single_dish(parameters):

@@ -309,7 +309,8 @@ class _tsara:
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
         The model is zero where .pb is below 0.1. .model.error is that of the sky, .image.error of the sky
-        times .pb. Not available with 'mosaic': specmode='cube'.
+        times .pb. Of a cube .pb and .weight are those of each channel. Not available for cubes of 'mosaic':
+        report, and saracompare.
 
     onepointing : bool, default False
         Opened by gridder = 'standard' or 'wproject'.
