@@ -108,8 +108,8 @@ class Deviations:
         return [z.size, (z < 1).mean(), (z < 2).mean(), np.median(z) / 0.6745] if z.size else [0, *3 * [np.nan]]
 
 
-def at_one_beam(sky, model, draws, beam) -> Deviations:
-    """Compare the model smoothed to the beam with the truth."""
+def at_one_beam(sky, model, draws, beam, seen=True) -> Deviations:
+    """Compare the model smoothed to the beam with the truth, where it is `seen`."""
     from casa_sara.analysis.metrics import smooth
 
     def smoothed(image):
@@ -117,7 +117,7 @@ def at_one_beam(sky, model, draws, beam) -> Deviations:
 
     error, found = draws.error(smoothed), smoothed(model)
     ratio = np.divide(found, error, out=np.zeros_like(found), where=error > 1e-3 * error.max())
-    where = ratio > SIGNIFICANT
+    where = (ratio > SIGNIFICANT) & seen
     return Deviations(((found - sky.smoothed(beam))[where] / error[where]), ratio[where])
 
 

@@ -3,6 +3,7 @@
     python benchmarks/mosaic.py FOLDER                 # seven pointings of M31 at 100 GHz, noise, gain errors of 1 %
     python benchmarks/mosaic.py FOLDER --scene W28     # another sky
     python benchmarks/mosaic.py FOLDER --speed         # an iteration of 23 pointings beside one of one pointing
+    python benchmarks/mosaic.py FOLDER --errors        # how often the truth lies within the errors of ndraws
 
 The visibilities are type-3 non-uniform transforms, exact with w, of a sky on pixels a third as large as those of the
 image, for each pair of dishes through the product of their Airy patterns (to their first nulls). tclean runs
@@ -19,6 +20,7 @@ import json
 import os
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -31,6 +33,7 @@ CELL, SIZE, FINER = 0.9, 200, 3  # arcsec, pixels, and the pixels of the sky in 
 SPACING = 29.0  # arcsec, half of the beam of a 12 m dish
 POINTINGS = [(0.0, 0.0), *((SPACING * np.cos(a), SPACING * np.sin(a)) for a in np.arange(6) * np.pi / 3)]
 ARRAYS = {"12m": ("alma.cycle8.1", 12.0, 1), "7m": ("aca.cycle8", 7.0, 4)}  # file, diameter, integrations in a scan
+FAINT = {"M31": (1.0, 3.0), "W28": (4.0, 12.0)}  # Jy of a visibility, for peaks of 80 and 25 times the noise
 NOISE, GAIN_RMS = 0.05, 0.01  # Jy of a visibility of two 12 m dishes; amplitude and phase
 WEIGHTINGS = {"briggs": 0.5, "natural": 0.0}
 # scales in beams, bias towards small ones, most iterations, gain and cyclefactor
@@ -165,6 +168,66 @@ def compare(folder, scene):
         print(f"| {label} | {half:.1f} | {one:.1f} | {flux:.3f} | {1e3 * left:.3f} | {took:.0f} |")
 
 
+@dataclass(frozen=True)
+class Truth:
+    """A sky as those of error_coverage.py."""
+
+    sky: object
+
+    def smoothed(self, beam):
+        """The sky smoothed to a beam (pixels, pixels, degrees), Jy/pixel."""
+        from scenes import smoothed_truth
+
+        return smoothed_truth(self.sky, beam[:2], beam[2])
+
+    def binned(self):
+        """The sky on the pixels of the image."""
+        return self.sky.truth()
+
+
+def errors(folder, realisations=4, ndraws=20):
+    """Print how often the true sky lies within the errors of a small mosaic, over skies and realisations of the noise.
+
+    Pixels at one beam and islands are counted as in error_coverage.py, where the
+    primary beam is above LEAST.
+    """
+    from error_coverage import Deviations, at_one_beam, of_islands
+    from simulated_mosaic import simulate_mosaic
+
+    from casa_sara import tsara
+    from casa_sara.demo.imagers import quiet, read_image
+    from casa_sara.reconstruction.draws import read_draws
+
+    beams, islands, known = [], [], []
+    for number, scene in enumerate(tuple(FAINT) * realisations):
+        here = folder / f"errors_{scene}_{number}"
+        here.mkdir(exist_ok=True)
+        sky, sources = the_sky(scene)
+        simulate_mosaic(here / "x.ms", POINTINGS, sources, dishes=(12.0,) * 14 + (7.0,) * 6, rounds=6, hours=5.0,
+                        noise=FAINT[scene][number // 2 % 2], spread=45.0, seed=number, fourier_sum=transform)
+        root = str(here / "tsara")
+        with quiet(here / "tsara.txt"):
+            made = tsara(**common(str(here / "x.ms")) | dict(imagename=root, ndraws=ndraws, overwrite=True, nthreads=1))
+        model, beam, pb = read_image(root + ".model")[0], read_image(root + ".image")[1], read_image(root + ".pb")[0]
+        beam, draws, seen = (beam[0] / CELL, beam[1] / CELL, beam[2]), read_draws(root + ".draws.npz"), pb > LEAST
+        truth = Truth(sky)
+        beams.append(at_one_beam(truth, model, draws, beam, seen))
+        inside = [island for island in made["sara"]["islands"] if seen[island["x_peak"], island["y_peak"]]]
+        of, shape = of_islands(truth, model, inside, draws, beam)
+        islands.append(of)
+        known.append(shape)
+        noise = read_image(root + ".residual")[0][seen].std()
+        print(scene, number, f"peak S/N {read_image(root + '.image')[0].max() / noise:.0f}, model",
+              f"{model[seen].sum():.3f} Jy of {sky.truth()[seen].sum():.3f},",
+              "pixels: {:.0f}, {:.2f}, {:.2f}, {:.2f}".format(*beams[-1].row(5, np.inf)),
+              "islands: {:.0f}, {:.2f}, {:.2f}, {:.2f}".format(*of.row(5, np.inf)), flush=True)
+    for label, found in ("at one beam", beams), ("islands", islands):
+        whole = Deviations(np.concatenate([one.z for one in found]), np.concatenate([one.ratio for one in found]))
+        print(f"{label}: {{:.0f}} places, {{:.2f}} within 1, {{:.2f}} within 2, median {{:.2f}}".format(
+            *whole.row(5, np.inf)))
+    print(f"islands, error of a known shape: {(np.abs(np.concatenate(known)) < 1).mean():.2f} within 1")
+
+
 def speed(pixels=1024, samples=200_000, side=5):
     """Time an iteration, and measure the memory of the operator, of one pointing and of 23 that cover the image."""
     from casa_sara.operators.beams import Beam, Mosaic
@@ -212,9 +275,14 @@ def main():
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--scene", default="M31")
     parser.add_argument("--speed", action="store_true")
+    parser.add_argument("--errors", action="store_true")
     args = parser.parse_args()
     if args.speed:
         speed()
+        return
+    if args.errors:
+        args.folder.mkdir(parents=True, exist_ok=True)
+        errors(args.folder)
         return
     folder = args.folder / args.scene.replace(" ", "_")
     folder.mkdir(parents=True, exist_ok=True)

@@ -2,6 +2,7 @@
 
     python benchmarks/outlier.py FOLDER            # VLA B at 1.4 GHz, M31 of 0.2 Jy, a double of 2 Jy 0.7 degrees away
     python benchmarks/outlier.py FOLDER --case D   # VLA D, 2 degrees away, with the w-term
+    python benchmarks/outlier.py FOLDER --seeds 4  # of the noise: what the outlier file loses, tsara alone
     python benchmarks/outlier.py FOLDER --time     # an iteration with and without an outlier
 
 Two observations with the same noise: of the field alone, and with the double beside it, whose sidelobes cover the
@@ -9,7 +10,7 @@ field. Visibilities are type-3 non-uniform transforms, exact with w, of a sky on
 image. The field is imaged from the first (`alone`), and from the second with the outlier file and without it. SNR =
 20 log10(‖truth‖/‖truth − model‖) of the field smoothed to half and to one beam. tclean runs multiscale, with the same
 file and pblimit=-1, without which it does nothing outside the primary beam; of GRID, that with the best SNR at half a
-beam is shown.
+beam is shown. outlier.png shows the models.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tests"), str(ROOT)]
 
@@ -110,7 +112,7 @@ def predicted(uvw, flux, *s):
     return np.exp(2j * np.pi * (s[:, 0] - [0, 0, 1]) @ uvw) * transform(uvw, near + [[0], [0], [1]], flux)
 
 
-def observe(folder, case, sources):
+def observe(folder, case, sources, seed=0):
     """Write the two MeasurementSets unless they are there; return their names."""
     from simulated_ms import column, edit, simulate
 
@@ -121,7 +123,7 @@ def observe(folder, case, sources):
             continue
         simulate(path, configuration=case.configuration, antennas=27, spws=(("1.4GHz", "2MHz", 3),), scans=8,
                  scan_seconds=8 * case.integration, integration=case.integration, spacing_seconds=2700, hour_angle=-3.0,
-                 sky=((0.0, 0.0, 0.0),), noise=NOISE)
+                 sky=((0.0, 0.0, 0.0),), noise=NOISE, seed=seed)
         freqs, uvw = column(path + "/SPECTRAL_WINDOW", "CHAN_FREQ")[:, 0], column(path, "UVW")
         vis = np.array([sum(predicted(uvw * freq / SPEED_OF_LIGHT, *part) for part in seen) for freq in freqs])
         edit(path, "DATA", lambda noise, vis=vis: noise + vis)
@@ -221,6 +223,41 @@ def compare(folder, case):
         half, one, flux = scored(sky, models[0], case, beam)
         far = "{:.4f} | {:.3f}".format(*of_double(models[1])) if len(models) > 1 else "– | –"
         print(f"| {label} | {half:.1f} | {one:.1f} | {flux:.3f} | {far} | {seconds:.0f} |")
+    draw(folder, case, sky, beam, [(rows[k][0], rows[k][1][0]) for k in (1, 4, 2)])
+
+
+def draw(folder, case, sky, beam, models):
+    """Draw the field, smoothed to half a beam, on one logarithmic scale: outlier.png."""
+    import matplotlib.pyplot as plt
+    from scenes import smoothed_truth
+
+    from casa_sara.analysis.metrics import smooth
+
+    fwhm = [0.5 * axis / case.cell for axis in beam[:2]]
+    panels = [("true sky", smoothed_truth(sky, fwhm, beam[2]))]
+    panels += [(label, smooth(model, fwhm, beam[2])) for label, model in models]
+    top = panels[0][1].max()
+    figure, axes_of_panels = plt.subplots(1, len(panels), figsize=(16, 4.3), layout="constrained")
+    for axis, (label, image) in zip(axes_of_panels, panels):
+        axis.imshow(np.log10(np.maximum(image / top, 1e-4)).T, origin="lower", vmin=-3.5, vmax=0, cmap="inferno")
+        axis.set(title=label, xticks=[], yticks=[])
+    figure.savefig(folder / "outlier.png", dpi=70)
+    plt.close(figure)
+
+
+def lost(folder, case, seeds):
+    """Print what becomes of the SNR of the field, with the outlier file, for several realisations of the noise."""
+    sky, *sources = the_sky(case)
+    for seed in range(seeds):
+        own, rows = folder / f"seed{seed}", []
+        own.mkdir(exist_ok=True)
+        names = observe(own, case, sources, seed)
+        for name, vis, with_file in (("alone", "alone", False), ("with_file", "both", True)):
+            models, beam, _ = imaged(own, case, names[vis], name, with_file)
+            rows.append(scored(sky, models[0], case, beam) + (list(of_double(models[1])) if with_file else []))
+        print(f"seed {seed}: field alone {rows[0][0]:.2f} and {rows[0][1]:.2f} dB, with the outlier file "
+              f"{rows[1][0] - rows[0][0]:+.2f} and {rows[1][1] - rows[0][1]:+.2f} dB; outlier {rows[1][3]:.4f} of its "
+              f"flux, {rows[1][4]:.4f} pixels off", flush=True)
 
 
 def iteration_time(pixels=1024, outlier=128, samples=200_000):
@@ -255,6 +292,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--case", default="B", choices=CASES)
+    parser.add_argument("--seeds", type=int, default=0)
     parser.add_argument("--time", action="store_true")
     args = parser.parse_args()
     if args.time:
@@ -262,7 +300,10 @@ def main():
         return
     folder = args.folder.resolve() / args.case
     folder.mkdir(parents=True, exist_ok=True)
-    compare(folder, CASES[args.case])
+    if args.seeds:
+        lost(folder, CASES[args.case], args.seeds)
+    else:
+        compare(folder, CASES[args.case])
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
-"""Wide bands: tsara with nterms compared with a flat model, with tclean mtmfs, and with sub-bands one by one.
+"""Wide bands: tsara with nterms, a flat model, tclean mtmfs, joined channels of wsclean, and sub-bands one by one.
 
     python benchmarks/wideband.py FOLDER              # everything; what FOLDER holds already is not done again
     python benchmarks/wideband.py FOLDER --only tsara   # simulate and run tsara (anew)
     python benchmarks/wideband.py FOLDER --only clean   # simulate and run tclean mtmfs
+    python benchmarks/wideband.py FOLDER --only wsclean # simulate and run wsclean, where it is installed
     python benchmarks/wideband.py FOLDER --only prior   # the prior of the orders compared with an ℓ2,1 norm
     python benchmarks/wideband.py FOLDER --only time    # sub-bands solved one by one, and together
     python benchmarks/wideband.py FOLDER --only table   # the tables of docs/validation.md
@@ -13,7 +14,9 @@ several beams, from −1.5 to +0.5. SNR is that of the model against the sky at 
 a half and to one beam (Briggs −1); that of tclean is the better of model and restored image. Errors of the index are
 rms over the pixels above a signal-to-noise ratio, the noise being what tsara leaves in the residual image; thermal is
 what the noise alone makes of it. tclean runs with each of GRID on TUNED_ON; the best by SNR at one beam, and the best
-by index, serve the others.
+by index, serve the others. wsclean runs multiscale with joined channels and each of WSCLEAN in the same way; its model
+is that of its two-term polynomial at the reference frequency, its index that of the restored channels or of the models
+of the channels at the beam, whichever is better on TUNED_ON.
 """
 
 from __future__ import annotations
@@ -21,6 +24,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
+import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
@@ -43,6 +48,18 @@ GRID = {
     "briggs": (SHORT, 0.0, 4000, "briggs"), "briggs biased": (SHORT, 0.6, 4000, "briggs"),
     "briggs deep": (SHORT, 0.0, 20_000, "briggs"), "briggs long": (LONG, 0.0, 4000, "briggs"),
     "briggs long deep": (LONG, 0.0, 20_000, "briggs"), "briggs deeper": (SHORT, 0.0, 60_000, "briggs"),
+}  # fmt: skip
+# weighting, robust, threshold in units of the noise, channels of the output, further options
+MASKED = ("-auto-mask", "3")
+WSCLEAN = {
+    "briggs+0 1 4": ("briggs", 0.0, 1.0, 4, MASKED), "briggs+0 0.5 4": ("briggs", 0.0, 0.5, 4, MASKED),
+    "briggs+0.5 1 4": ("briggs", 0.5, 1.0, 4, MASKED), "briggs+0.5 0.5 4": ("briggs", 0.5, 0.5, 4, MASKED),
+    "natural 1 4": ("natural", 0.0, 1.0, 4, MASKED), "natural 0.5 4": ("natural", 0.0, 0.5, 4, MASKED),
+    "briggs-1 1 4": ("briggs", -1.0, 1.0, 4, MASKED), "briggs-1 0.5 4": ("briggs", -1.0, 0.5, 4, MASKED),
+    "briggs+0 0.5 8": ("briggs", 0.0, 0.5, 8, MASKED), "briggs-1 0.5 8": ("briggs", -1.0, 0.5, 8, MASKED),
+    "briggs-1 1 4 unmasked": ("briggs", -1.0, 1.0, 4, ()), "briggs-1 0.5 4 unmasked": ("briggs", -1.0, 0.5, 4, ()),
+    "briggs-0.5 1 4 unmasked": ("briggs", -0.5, 1.0, 4, ()), "briggs+0 1 4 unmasked": ("briggs", 0.0, 1.0, 4, ()),
+    "briggs-1 0.5 4 slow": ("briggs", -1.0, 0.5, 4, (*MASKED, "-multiscale-gain", "0.05", "-mgain", "0.6")),
 }  # fmt: skip
 TUNED_ON = "S M31"
 
@@ -218,11 +235,57 @@ def run_clean(name, folder, settings):
         kept.write_text(json.dumps(result))
 
 
-def best_settings(folder):
+def run_wsclean(name, folder, settings):
+    """Run wsclean with joined channels and some settings."""
+    from astropy.io import fits
+
+    from casa_sara.analysis.metrics import smooth
+    from casa_sara.demo.imagers import read_image
+
+    case, sky, folder, common, cell = simulated(name, folder)
+    kept = folder / "wsclean.json"
+    result = json.loads(kept.read_text()) if kept.exists() else {}
+    noise = json.loads((folder / "tsara.json").read_text())["3"]["noise"]
+    beam = read_image(folder / "tsara3.image")[1]
+    measures = Measures(case, sky, beam, cell)
+    for setting in settings:
+        if setting in result:
+            continue
+        weighting, robust, sigma, channels, more = WSCLEAN[setting]
+        root = folder / f"wsclean_{setting.replace(' ', '_')}"
+        command = ["wsclean", "-j", "1", "-size", *map(str, common["imsize"]), "-scale", f"{cell}asec", "-weight",
+                   *([weighting, str(robust)] if weighting == "briggs" else [weighting]), "-multiscale",
+                   "-join-channels", "-channels-out", str(channels), "-fit-spectral-pol", "2", "-niter", "1000000",
+                   "-mgain", "0.8", "-auto-threshold", str(sigma), *more, "-data-column", "DATA", "-pol",
+                   "I", "-beam-shape", f"{beam[0]}asec", f"{beam[1]}asec", f"{beam[2]}deg",
+                   "-no-update-model-required", "-name", str(root), *common["vis"]]
+        begin = time.perf_counter()
+        with open(folder / "wsclean.txt", "w", encoding="utf-8") as log:
+            subprocess.run(command, check=True, stdout=log, stderr=log)
+        seconds = time.perf_counter() - begin
+        files = [[f"{root}-{k:04d}-{kind}.fits" for k in range(channels)] for kind in ("model", "image")]
+        models, restored = (np.array([fits.getdata(file).squeeze().T for file in some], float) for some in files)
+        freqs = np.array([fits.getheader(file)["CRVAL3"] for file in files[0]])
+        powers = (freqs / case.freq_hz - 1)[:, None] ** np.arange(2)
+        model = np.tensordot(np.linalg.pinv(powers)[0], models, 1)  # its channels are on this line
+        at_beam = np.array([smooth(one, measures._beam, measures._angle) for one in models])
+        result[setting] = dict(snr=measures.snr(model, np.tensordot(np.linalg.pinv(powers)[0], restored, 1)),
+                               seconds=seconds)
+        for kind, seen in (("index", restored), ("index of models", at_beam)):
+            known = (seen > 0).all(axis=0)
+            place = np.log(freqs / case.freq_hz)
+            slope = np.tensordot(np.linalg.pinv(np.stack([place**0, place], axis=1))[1], np.log(
+                np.where(known, seen, 1.0)), 1)
+            result[setting][kind] = measures.of_index(slope, noise, known)
+        print(name, "wsclean", setting, json.dumps(result[setting]), flush=True)
+        kept.write_text(json.dumps(result))
+
+
+def best_settings(folder, grid=GRID, file="clean.json"):
     """The settings that are best on TUNED_ON."""
-    found = json.loads((folder / TUNED_ON.replace(" ", "_") / "clean.json").read_text())
-    return list(dict.fromkeys([max(GRID, key=lambda one: found[one]["snr"][1]),
-                               min((one for one in GRID if found[one]["index"]["30"]["known"] > 0.99),
+    found = json.loads((folder / TUNED_ON.replace(" ", "_") / file).read_text())
+    return list(dict.fromkeys([max(grid, key=lambda one: found[one]["snr"][1]),
+                               min((one for one in grid if found[one]["index"]["30"]["known"] > 0.99),
                                    key=lambda one: found[one]["index"]["100"]["rms"])]))
 
 
@@ -311,6 +374,9 @@ def tables(folder):
             if (where / file).exists():
                 found = json.loads((where / file).read_text())
                 rows += [(f"mtmfs {one}", found[one]) for one in found] if not label else [(label, found)]
+        if (where / "wsclean.json").exists():
+            for setting, one in json.loads((where / "wsclean.json").read_text()).items():
+                rows += [(f"wsclean {setting}", one), ("the same, of models", one | dict(index=one["index of models"]))]
         for kind, one in rows:
             print(line(name, kind, one))
         three = json.loads((where / "tsara.json").read_text())["3"]
@@ -355,7 +421,8 @@ def pictures(folder):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--only", choices=("tsara", "clean", "prior", "time", "table", "pictures"))
+    parser.add_argument("--only", choices=("tsara", "clean", "wsclean", "prior", "time", "table",
+                                           "pictures"))
     parser.add_argument("--cases", default=",".join(CASES))
     given = parser.parse_args()
     folder, names = given.folder.resolve(), given.cases.split(",")
@@ -367,6 +434,11 @@ def main():
             run_clean(TUNED_ON, folder, GRID)
         for name in names:
             run_clean(name, folder, best_settings(folder))
+    if given.only in (None, "wsclean") and shutil.which("wsclean"):
+        if TUNED_ON in names:
+            run_wsclean(TUNED_ON, folder, WSCLEAN)
+        for name in names:
+            run_wsclean(name, folder, best_settings(folder, WSCLEAN, "wsclean.json"))
     for what, do in (("prior", compare_priors), ("time", time_one_by_one), ("table", tables), ("pictures", pictures)):
         if given.only in (None, what):
             do(folder)

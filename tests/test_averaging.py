@@ -12,6 +12,7 @@ from casa_sara.operators.beams import Beam, Mosaic
 from casa_sara.operators.sky import sky_operator
 from casa_sara.options import ImageGrid, SolverOptions, Spectrum
 from casa_sara.reconstruction.checkpoint import Checkpoint
+from casa_sara.reconstruction.flat_noise import FlatNoise
 from casa_sara.reconstruction.problem import Problem, Samples, averaging_cell
 from casa_sara.reconstruction.reconstruct import Control, reconstruct
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
@@ -268,20 +269,52 @@ def test_nothing_is_averaged_where_it_is_not_worthwhile_or_not_possible():
     assert "databound = 'weights'" in told[0] and "method = 'dabbech2018'" in told[1] and "more than half" in told[2]
 
 
-def test_mosaics_are_not_averaged():
-    """Samples of one uv cell that two pointings have observed are not of one mean."""
-    samples, _ = observed(40)
+def mosaic_of(noise_db, seed=0):
+    """Samples of the sources by two pointings, whose parts of the image overlap, with the grid."""
+    samples, noise = observed(noise_db, seed)
     falls = np.linspace(1, 0, 257, dtype=np.float32)
-    beams = tuple(Beam((x, 20.0), 4e-5, falls) for x in (10.0, 38.0))
+    beams = tuple(Beam((x, 20.0), 2.2e-5, falls) for x in (10.0, 38.0))
     grid = replace(GRID, gridder="mosaic", mosaic=Mosaic(GRID.shape, GRID.cell_rad, beams))
-    data, sky, told = samples.data, sky_of(SOURCES), []
-    data.beam = (data.row % 2).astype(np.int32)
+    data, sky = samples.data, sky_of(SOURCES)
+    data.beam = (data.row // 2 % 2).astype(np.int32)
     seen = sky_operator(data.uvw, grid, beam=data.beam).forward(sky.astype(np.float32))
     data.vis += seen - fourier(data.uvw, sky, GRID)
-    found = reconstruct(samples, grid, OPTIONS, support=sky > 0, control=Control(tell=told.append))
-    assert told == ["visibilities are not averaged: gridder = 'mosaic'"] and found.averaging == {}
-    np.testing.assert_allclose(found.residual_norms, norms_of_all(samples, found.model, grid), rtol=1e-4)
-    np.testing.assert_allclose(found.model, sky, atol=0.02)
+    return samples, grid, noise
+
+
+def test_averages_of_a_mosaic_are_of_one_pointing_and_around_its_middle():
+    """Φx and Φ†UΦx, and the weights of each pointing; sources far from the centre of the image, with w."""
+    samples, grid, _ = mosaic_of(40)
+    data = samples.data
+    options = replace(OPTIONS, precondition=True)
+    every, few = (Problem.of(samples, grid, replace(options, averaging=on), 1.0, 1e-6) for on in (False, True))
+    assert every.averaged is None and few.vis.size < 0.5 * every.vis.size and np.abs(data.uvw[2]).max() > 1e4
+    weights = np.bincount(few.averaged.part_of_cell, few.averaged.sum_of_weights)
+    np.testing.assert_allclose(weights, np.bincount(data.beam, data.weight.astype(float)), rtol=1e-9)
+    image = sky_of(SOURCES).astype(np.float32)
+    predicted, exact = few.measurement.forward(image), few.averaged.whitened_mean(every.measurement.forward(image))
+    assert np.linalg.norm(predicted - exact) < 5e-3 * np.linalg.norm(exact)
+    one, other = (each.measurement.adjoint(each.precond * each.measurement.forward(image)) for each in (every, few))
+    assert np.linalg.norm(one - other) < 2e-2 * np.linalg.norm(one)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise_db", [20, 50])
+def test_the_solution_of_a_mosaic_is_that_of_all_samples_within_a_tenth_of_the_noise(noise_db):
+    """In the centre and in the corners; rms of four observations."""
+    support, different = sky_of(SOURCES) > 0, []
+    for seed in range(4):
+        samples, grid, noise = mosaic_of(noise_db, seed)
+        sensitivity = FlatNoise.of(samples.data, grid).sensitivity
+        every = reconstruct(samples, grid, replace(OPTIONS, averaging=False), support=support)
+        told = []
+        few = reconstruct(samples, grid, OPTIONS, support=support, control=Control(tell=told.append))
+        assert few.averaging["averages"] < 0.3 * samples.data.size and "pointing and kind of baseline" in told[0]
+        different.append([(few.model - every.model)[place] * sensitivity[place] / noise for place in SOURCES])
+        np.testing.assert_allclose(few.residual_norms, every.residual_norms, rtol=1e-4)
+        np.testing.assert_allclose(few.residual_norms, norms_of_all(samples, few.model, grid), rtol=1e-4)
+        np.testing.assert_allclose(few.model, sky_of(SOURCES), atol=6 * noise / sensitivity[support].min())
+    assert np.sqrt(np.mean(np.square(different), axis=0)).max() < 0.1
 
 
 def norms_of_all(samples, model, grid=GRID):

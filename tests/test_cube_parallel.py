@@ -25,7 +25,7 @@ GRID = dict(imsize=[64, 60], cell="10arcsec", datacolumn="data", specmode="cube"
 LINE = np.array([0.2, 0.5, 1.0, 0.3, 0.2])  # Jy in each channel
 BLANK = 1
 LIMIT = 300  # s
-PRODUCTS = ("model", "residual", "psf", "image", "mask", "sumwt")
+PRODUCTS = ("model", "residual", "psf", "image", "mask", "sumwt", "model.error", "image.error")
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(
     shutil.which("mpirun") is None or importlib.util.find_spec("mpi4py") is None
@@ -41,7 +41,7 @@ def runs(tmp_path_factory):
     model = column(vis, "MODEL_DATA")
     edit(vis, "DATA", lambda data: data + (LINE[:, None] - 1) * model)
     edit(vis, "FLAG", lambda flag: flag | (np.arange(5) == BLANK)[:, None])
-    common = dict(vis=str(vis), mask="circle[[30pix,27pix],12pix]", **GRID)
+    common = dict(vis=str(vis), mask="circle[[30pix,27pix],12pix]", ndraws=2, **GRID)
     return folder, common, tsara(imagename=str(folder / "one"), **common)
 
 

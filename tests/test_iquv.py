@@ -1,6 +1,7 @@
 """Several Stokes parameters of one image: against tclean's images of them, and against images of each alone."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,7 +12,9 @@ from test_visibilities import observation
 
 casatools = pytest.importorskip("casatools")
 
-from casa_sara import tsara
+from casa_sara import saracompare, tsara
+from casa_sara.analysis.comparison import Product
+from casa_sara.analysis.polarisation import polarised_measures
 from casa_sara.casa.images.image_plane import read_planes
 from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.runtime.tools import opened
@@ -83,7 +86,7 @@ def test_all_stokes_are_read_as_each_alone(observed):
 
 
 @pytest.mark.slow
-def test_without_the_cone_each_is_what_it_is_alone(observed):
+def test_without_the_bound_each_is_what_it_is_alone(observed):
     result = tsara(vis=observed["circular"], imagename="all", stokes="IQU", polbound=False, pbcor=True, **SHORT)
     for number, stokes in enumerate("IQU"):
         alone = tsara(vis=observed["circular"], imagename=stokes, stokes=stokes, positivity=stokes == "I", pbcor=True,
@@ -99,12 +102,14 @@ def test_without_the_cone_each_is_what_it_is_alone(observed):
 
 @pytest.mark.slow
 def test_no_pixel_is_polarised_beyond_its_brightness(observed):
+    import casatasks
+
     given = dict(vis=observed["linear"], stokes="IQUV", polbound=True, mask="box[[10pix,10pix],[70pix,64pix]]") | GRID
     result = tsara(imagename="x", **given)
     model, *_ = planes("x.model")
     polarised = np.sqrt(np.square(model[1:], dtype=float).sum(axis=0))
     above = polarised > model[0] * (1 + 1e-6)
-    for x, y in ((48, 30), (28, 50)):  # around unresolved sources, where I may be negative, there is no cone
+    for x, y in ((48, 30), (28, 50)):  # around unresolved sources, where I may be negative, there is no bound
         above[x - 2 : x + 3, y - 2 : y + 3] = False
     assert not above.any() and polarised.max() > 0.25
     assert not model[:, :10].any() and planes("x.mask")[2] == [80, 72, 4, 1]
@@ -115,6 +120,15 @@ def test_no_pixel_is_polarised_beyond_its_brightness(observed):
     assert [island["right_ascension"][:8] for island in result["sara"]["stokes"][0]["islands"][:2]]
     with open("x.sara.json") as record:
         assert json.load(record)["stokes"][3]["stokes"] == "V"
+    # tclean's beside it: the same intensity and angle where it is bright
+    theirs = {name: value for name, value in given.items() if name not in ("nthreads", "polbound")}
+    casatasks.tclean(imagename="c", niter=300, **theirs)
+    measures = saracompare(models=["x", "c"], outdir="report")["products"]
+    found = measures["x"]["polarisation"]
+    assert found["peak_jy_per_beam"] == pytest.approx(np.hypot(SKY["Q"], SKY["U"]).max(), rel=0.05)
+    assert 0.3 < found["fraction"] < 0.5 and "snr" not in found
+    assert measures["c"]["polarisation"]["snr"] > 20 and measures["c"]["polarisation"]["angle_rms_deg"] < 2
+    assert measures["x"]["natural"]["sigma"] > 0 and os.path.getsize("report/polarisation.png") > 20_000
     # a restart goes on from the models of all
     again = tsara(imagename="x", restart=True, niter=0, **given)
     for entry, plane in zip(again["sara"]["stokes"], model):
@@ -142,15 +156,15 @@ def test_what_several_do_not_have_is_refused(observed, given, message):
 
 
 def test_a_dry_run_counts_all_of_them(observed):
-    one, four = (tsara(vis=observed["circular"], imagename="x", stokes=stokes, dryrun=True, **GRID)["forecast"]
-                 for stokes in ("I", "IQUV"))
+    given = dict(vis=observed["circular"], imagename="x", polbound=True, dryrun=True) | GRID
+    one, four = (tsara(stokes=stokes, **given)["forecast"] for stokes in ("I", "IQUV"))
     part = "wavelet duals and weights"
-    assert four["memory_bytes"]["iterating"][part] == 4 * one["memory_bytes"]["iterating"][part]
+    assert four["memory_bytes"]["iterating"][part] == 3 * one["memory_bytes"]["iterating"][part]
     assert four["memory_bytes"]["reading"]["further Stokes parameters"] == 36 * four["visibilities"]
     assert four["seconds"]["total"] > 1.5 * one["seconds"]["total"]
 
 
-def _problems(stop_at=None):
+def _problems(stopping=lambda reached: False):
     """I, Q and U of two sources, one more polarised than bright, and noise."""
     shape = (48, 48)
     sums, problems, reached = Sums(shape), [], {}
@@ -161,44 +175,72 @@ def _problems(stop_at=None):
         data.weight[:] = sums.weight
         data.vis[:] = sums.of((fluxes[0] * NOISE, 30, 20, 0), (fluxes[1] * NOISE, 18, 30, 6)) + sums.noise(seed)
         control = Control(lambda ppd, record, stokes=stokes: reached.__setitem__(stokes, ppd.iteration),
-                          lambda: stop_at in reached.values())
+                          lambda: stopping(reached))
         problems.append(StokesProblem(stokes, Samples(data, offsets, np.ones(data.size), np.ones(2)), None, control))
-    return problems, ImageGrid(shape, (CELL, CELL), stokes="IQU"), SolverOptions(**OPTIONS)
+    return problems, ImageGrid(shape, (CELL, CELL), stokes="IQU"), SolverOptions(**OPTIONS, polbound=True)
 
 
 @pytest.mark.slow
-def test_side_by_side_goes_on_from_a_checkpoint_as_if_never_stopped(tmp_path):
-    """Of Stokes parameters that are still going on, and of those that have come to their ends."""
-    def run(stop_at=None):
+def test_a_checkpoint_continues_as_if_nothing_had_stopped(tmp_path):
+    """While I is solved, while Q and U are, and when one of these has come to its end."""
+    def run(stopping=lambda reached: False):
         checkpoint = Checkpoint(str(tmp_path / "c"), "1", {})
         if (tmp_path / "c").exists():
             checkpoint.open()
-        problems, grid, options = _problems(stop_at)
+        problems, grid, options = _problems(stopping)
         return reconstruct_polarised(problems, grid, options, checkpoint=checkpoint)
 
     problems, grid, options = _problems()
     wanted = reconstruct_polarised(problems, grid, options)
-    ends = sorted(one.record.iteration[-1] for one in wanted.values())
-    assert run(25)["I"].record.stop_code == STOPPED_BY_USER
-    between = run((ends[0] + ends[1]) // 2)
-    assert [one.record.stop_code == STOPPED_BY_USER for one in between.values()].count(True) == 2
+    ends = {stokes: one.record.iteration[-1] for stokes, one in wanted.items()}
+    first, second = sorted(("Q", "U"), key=ends.get)
+    assert ends[first] < ends[second] - 2
+    assert run(lambda reached: reached.get("I") == 25)["I"].record.stop_code == STOPPED_BY_USER
+    found = run(lambda reached: reached.get("Q") == 25)
+    assert [found[stokes].record.stop_code == STOPPED_BY_USER for stokes in "IQU"] == [False, True, True]
+    found = run(lambda reached: reached.get(second) == ends[second] - 1)
+    assert [found[stokes].record.stop_code == STOPPED_BY_USER for stokes in ("I", first, second)] == [0, 0, 1]
     found = run()
+    assert found[second].record.resumed == [25, ends[second] - 1]
     for stokes, one in wanted.items():
         np.testing.assert_array_equal(found[stokes].model, one.model)
         np.testing.assert_array_equal(found[stokes].l2_bounds, one.l2_bounds)
-    model = {stokes: one.model.astype(float) for stokes, one in wanted.items()}
-    resolved = distance((48, 48), 30, 20) > 6  # around the other, a point, there is no cone
-    assert np.all((np.hypot(model["Q"], model["U"]) <= model["I"] * (1 + 1e-6))[resolved])
 
 
-def test_the_cone_lifts_what_is_too_faint_for_its_polarisation():
-    """A source whose Q and U together are brighter than the I that noise leaves; alone, each exceeds it."""
+def test_the_bound_leaves_brightness_as_it_is_and_confines_its_polarisation():
+    """Of one source Q and U together are brighter than I; around the other, a point, there is no bound."""
     problems, grid, options = _problems()
     together = reconstruct_polarised(problems, grid, options)
     alone = {one.stokes: reconstruct(one.samples, grid, SolverOptions(**OPTIONS, positivity=one.stokes == "I"))
              for one in problems}
+    np.testing.assert_array_equal(together["I"].model, alone["I"].model)
+    resolved = distance((48, 48), 30, 20) > 6
+    for found, within in (together, True), (alone, False):
+        i, q, u = (found[stokes].model.astype(float) for stokes in "IQU")
+        assert np.all((np.hypot(q, u) <= i * (1 + 1e-6))[resolved]) == within
     area = np.s_[10:27, 22:39]
-    fluxes = [{stokes: float(one.model[area].sum()) for stokes, one in found.items()} for found in (together, alone)]
-    assert np.hypot(fluxes[1]["Q"], fluxes[1]["U"]) > fluxes[1]["I"]
-    assert np.hypot(fluxes[0]["Q"], fluxes[0]["U"]) <= fluxes[0]["I"] * (1 + 1e-5)
-    assert fluxes[0]["I"] > fluxes[1]["I"]
+    fluxes = [np.hypot(*(found[stokes].model[area].sum() for stokes in "QU")) for found in (together, alone)]
+    assert fluxes[0] < together["I"].model[area].sum() < fluxes[1]
+
+
+def test_polarised_intensity_and_angle_are_measured_against_a_reference():
+    """A source turned by 10 degrees and 20 % fainter; noise alone tells the level."""
+    x, y = np.mgrid[-32:32, -32:32]
+    source = np.exp(-(x**2 + y**2) / 50) + 0j
+    rng, beams = np.random.default_rng(4), {"natural": (3.0, 3.0, 0.0)}
+    residual = {"natural": 0.01 * rng.standard_normal((64, 64))}
+    turned = 0.8 * source * np.exp(2j * np.radians(10))
+    products = [Product("one", 2 * source.real, residual, residual, polarised=source * np.exp(0.3j)),
+                Product("without", source.real, residual, residual),
+                Product("other", 2 * source.real, residual, residual, polarised=turned * np.exp(0.3j))]
+    found = polarised_measures(products, (1.0, 1.0), beams)
+    assert found.keys() == {"one", "other"} and "snr" not in found["one"]
+    assert found["other"]["angle_rms_deg"] == pytest.approx(10, rel=1e-6)
+    assert [found[name]["fraction"] for name in found] == pytest.approx([0.5, 0.4], rel=1e-6)
+    assert found["other"]["snr"] == pytest.approx(-20 * np.log10(abs(1 - 0.8 * np.exp(2j * np.radians(10)))), rel=1e-6)
+    area = np.pi * 9 / (4 * np.log(2))
+    assert found["one"]["level_jy_per_beam"] == pytest.approx(0.1, rel=0.05)
+    assert 0.8 * area < found["one"]["peak_jy_per_beam"] < area
+    against = polarised_measures(products, (1.0, 1.0), beams, source)
+    assert against["one"]["angle_rms_deg"] == pytest.approx(np.degrees(0.15), rel=1e-6)
+    assert polarised_measures(products[1:2], (1.0, 1.0), beams) == {}

@@ -170,6 +170,7 @@ from casa_sara import tsara
 from casa_sara.casa.images.primary_beams import primary_beams
 from casa_sara.casa.ms.read import read_visibilities
 from casa_sara.casa.runtime import log
+from casa_sara.reconstruction.draws import read_draws
 from casa_sara.solver.record import STOPPED_BY_USER
 
 GRID = dict(imsize=[240, 216], cell="0.9arcsec", gridder="mosaic", phasecenter=AT_CENTRE, datacolumn="data")
@@ -311,6 +312,29 @@ def test_sources_are_recovered_in_place_and_flux(mixed, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+def test_errors_are_those_of_the_sky(mixed, tmp_path, monkeypatch):
+    """.model.error and flux errors by the noise where a source is; .image.error of flat noise."""
+    monkeypatch.chdir(tmp_path)
+    options = GRID | dict(vis=mixed, wavelets=["dirac"], pbcor=True, nthreads=1)
+    result = tsara(imagename="x", ndraws=6, jackknife=True, blocks=4, **options)["sara"]
+    pb, error, model = pixels("x.pb"), pixels("x.model.error"), pixels("x.model")
+    draws = read_draws("x.draws.npz")
+    np.testing.assert_allclose(error, draws.error(), rtol=1e-5)
+    noise = pixels("x.residual")[pb > 0.3].std()
+    for flux, l, m in SKY:
+        x, y = round(120 - l / ARCSEC / 0.9), round(108 + m / ARCSEC / 0.9)
+        island = min(result["islands"], key=lambda one: np.hypot(one["x_peak"] - x, one["y_peak"] - y))
+        assert island["flux_jy"] == pytest.approx(flux, abs=4 * island["bootstrap_error_jy"])
+        # a point's flux is known to the noise over the primary beam
+        assert 0.5 < island["bootstrap_error_jy"] / (noise / pb[x, y]) < 4
+        assert 0.3 * noise < pixels("x.image.error")[x, y] < 3 * noise
+        assert np.isfinite(pixels("x.image.jackknife")[x, y]) and island["jackknife_error_jy"] > 0
+    weight = pixels("x.weight")
+    unseen = weight < 0.0095 * weight.max()
+    assert unseen.any() and not error[unseen].any() and not model[unseen].any()
+
+
+@pytest.mark.slow
 def test_fields_of_several_measurement_sets_are_one_mosaic(folder, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = [simulate_mosaic(folder / f"part{k}.ms", HEXAGON[k : k + 2], SKY[:2], dishes=(12.0,) * 8, noise=0.1, seed=5)
@@ -382,14 +406,88 @@ def test_model_column_is_the_sky_through_the_beams(folder, tmp_path, monkeypatch
         np.testing.assert_allclose(hand, expected, atol=1e-3)  # what is left of w
 
 
+# Cubes ------------------------------------------------------------------------------------------
+
+
+def planes(name):
+    """Return the channels of a cube, (nchan, nx, ny)."""
+    ia = casatools.image()
+    ia.open(name)
+    cube = ia.getchunk()[:, :, 0, :]
+    ia.close()
+    return np.moveaxis(cube, 2, 0)
+
+
+@pytest.fixture(scope="module")
+def line(folder):
+    """Three pointings of four channels, of which the third has a half of all, noise included: two point sources."""
+    sky = [(1.0, 0.0, 0.0), (1.0, 25 * ARCSEC, 8 * ARCSEC)]
+    name = simulate_mosaic(folder / "line.ms", HEXAGON[:3], sky, dishes=(12.0,) * 7 + (7.0,) * 3, noise=0.2, rounds=3,
+                           hours=3.0, spws=(("100GHz", "30MHz", 4),))
+    edit(name, "DATA", lambda old: old * np.array([1, 1, 0.5, 1])[:, None])
+    return name
+
+
+CUBE = GRID | dict(imsize=[160, 150], specmode="cube", outframe="LSRK", interpolation="nearest")
+
+
+def test_dirty_cube_of_a_mosaic_is_near_tcleans(line, tmp_path, monkeypatch):
+    """Channel by channel; of the first channel also the image of that channel alone. Flagged in one: weaker there."""
+    import casatasks
+
+    monkeypatch.chdir(tmp_path)
+    os.system(f"cp -r {line} part.ms")
+    field = column("part.ms", "FIELD_ID")
+    edit("part.ms", "FLAG", lambda old: old | ((np.arange(4)[None, :, None] == 2) & (field == 1)))
+    tsara(vis="part.ms", imagename="ours", niter=0, pblimit=0.1, **CUBE)
+    casatasks.tclean(vis="part.ms", imagename="theirs", niter=0, pblimit=0.1, restoration=False, **CUBE)
+    weights, pbs = planes("ours.weight"), planes("ours.pb")
+    assert planes("ours.model").shape == (4, 160, 150)
+    assert not np.allclose(weights[2], weights[1], atol=0.02 * weights.max())  # a pointing is missing
+    np.testing.assert_allclose(planes("ours.sumwt").ravel(), planes("theirs.sumwt").ravel(), rtol=1e-4)
+    for k in range(4):
+        pb, theirs = pbs[k], planes("theirs.pb")[k]
+        good = (pb > 0.2) & (theirs > 0)
+        assert pb.max() == 1 and np.abs(pb - theirs)[good].max() < 0.02
+        assert np.abs(weights[k] - planes("theirs.weight")[k])[good].max() < 0.03 * weights[k].max()
+        one, other = planes("ours.residual")[k][good], planes("theirs.residual")[k][good]
+        assert np.abs(one - other).max() < 0.08 * other.max()
+        assert np.vdot(one, other) / np.vdot(other, other) == pytest.approx(1, abs=0.02)
+    # the image of one channel alone
+    tsara(vis="part.ms", imagename="alone", niter=0, pblimit=0.1, spw="0:2", **CUBE | dict(specmode="mfs"))
+    np.testing.assert_allclose(pixels("alone.weight"), weights[2], atol=5e-4)
+    np.testing.assert_allclose(pixels("alone.residual"), planes("ours.residual")[2], atol=5e-4)
+
+
+@pytest.mark.slow
+def test_channels_of_a_mosaic_are_the_sky(line, tmp_path, monkeypatch):
+    """Fluxes of every channel, its errors, .image of flat noise, and the model column through the beams."""
+    monkeypatch.chdir(tmp_path)
+    os.system(f"cp -r {line} line.ms")
+    result = tsara(vis="line.ms", imagename="x", pbcor=True, nthreads=1, wavelets=["dirac"], savemodel="modelcolumn",
+                   ndraws=2, **CUBE | dict(nchan=2, start=1))
+    model, image, corrected, pb = (planes("x." + name) for name in ("model", "image", "image.pbcor", "pb"))
+    assert model.shape == (2, 160, 150) and planes("x.model.error").any()
+    for k in range(2):
+        for x, y in ((80, 75), (52, 84)):
+            assert model[k, x - 8 : x + 9, y - 8 : y + 9].sum() == pytest.approx((1, 0.5)[k], rel=0.05)
+        good = pb[k] > 0.2
+        np.testing.assert_allclose(corrected[k][good], (image[k] / np.where(good, pb[k], 1))[good], rtol=1e-4)
+    residual = planes("x.residual")
+    assert len(result["sara"]["channels"]) == 2 and np.abs(residual).max() < 0.1
+    written, observed = column("line.ms", "MODEL_DATA"), column("line.ms", "DATA")
+    assert not written[:, 0].any() and not written[:, 3].any()  # of no channel of the image
+    ends = np.array([12.0] * 7 + [7.0] * 3)[[column("line.ms", f"ANTENNA{n}") for n in (1, 2)]]
+    sigma = 0.2 * (12 / ends).prod(axis=0)
+    left = np.abs(observed - written)[:, 1:3] / sigma / np.array([1, 0.5])[:, None]
+    assert np.sqrt(np.mean(left**2) / 2) == pytest.approx(1, abs=0.05)
+
+
 # Refused ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("parameters, message", [
-    (dict(specmode="cube"), "specmode = 'cube' with gridder = 'mosaic'"),
-    (dict(parallel=True), "parallel = True with gridder = 'mosaic'"),
-    (dict(ndraws=20), "ndraws = 20 with gridder = 'mosaic': .*; should be 0"),
-    (dict(jackknife=True), "jackknife = True with gridder = 'mosaic': .*; should be False"),
+    (dict(specmode="cube", report=True), "report = True with gridder = 'mosaic' and specmode = 'cube'"),
     (dict(usepointing=True), "usepointing = True: should be True or False out of False|usepointing = True"),
     (dict(gridder="standard"), "gridder = 'standard': 7 fields, up to 3[0-9.]* arcsec apart, would be imaged as one "
      "pointing: should be gridder = 'mosaic'"),

@@ -1,5 +1,6 @@
 """Unknown spectra: frequencies, operator and prior against explicit sums and matrices, and whole runs."""
 
+import json
 import os
 from dataclasses import replace
 from types import SimpleNamespace
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from dense_problem import DenseMeasurement
 from scipy.optimize import minimize
+from simulated_ms import column, edit, pixels
 from test_spectral import CELL, GRID, INDEX, REFERENCE, SHAPE, SIZE, SOURCES, fluxes, fourier_sum, residual_noise, vis
 
 casatools = pytest.importorskip("casatools")
@@ -269,7 +271,7 @@ def test_index_and_error_of_a_power_law():
 @pytest.fixture(scope="module")
 def run(vis, tmp_path_factory):
     name = str(tmp_path_factory.mktemp("run") / "spectra")
-    return tsara(vis=vis, imagename=name, nterms=3, **GRID), name
+    return tsara(vis=vis, imagename=name, nterms=3, savemodel="modelcolumn", **GRID), name
 
 
 def opened(name):
@@ -312,6 +314,61 @@ def test_cube_of_the_frequencies(run):
     for (x, y), flux in SOURCES.items():
         found = cube[x - 2 : x + 3, y - 2 : y + 3].sum(axis=(0, 1))
         np.testing.assert_allclose(found, flux * (np.array(freqs) / REFERENCE) ** INDEX, rtol=0.015)
+
+
+def left_in_columns(vis):
+    """Reduced χ² of DATA − MODEL_DATA, by window."""
+    window, sigma = column(vis, "DATA_DESC_ID"), column(vis, "SIGMA")
+    power = np.abs(column(vis, "DATA") - column(vis, "MODEL_DATA")) ** 2 / (2 * sigma[:, None, :] ** 2)
+    return [float(power[..., window == number].mean()) for number in np.unique(window)]
+
+
+def test_model_column_has_the_spectra(run, vis):
+    assert max(left_in_columns(vis)) < 1.1
+    edit(vis, "MODEL_DATA", lambda old: np.zeros_like(old))
+    tsara(vis=vis, imagename=run[1], nterms=3, savemodel="modelcolumn", niter=0, restart=True, **GRID)
+    assert max(left_in_columns(vis)) < 1.1
+
+
+@pytest.mark.slow
+def test_errors_are_of_the_draws(run, vis, tmp_path, monkeypatch):
+    name = str(tmp_path / "drawn")
+    result = tsara(vis=vis, imagename=name, nterms=3, ndraws=8, jackknife=True, **GRID)
+    assert result["sara"]["draws"] == dict(asked=8, made=8)
+    for suffix in (".model", ".alpha", ".subbands"):
+        np.testing.assert_array_equal(pixels(name + suffix), pixels(run[1] + suffix))
+    for suffix, unit in ((".model.error", "Jy/pixel"), (".image.error", "Jy/beam"), (".image.jackknife", "Jy/beam")):
+        ia = opened(name + suffix)
+        assert ia.brightnessunit() == unit and ia.getchunk().shape == (64, 64, 1, 1) and ia.getchunk().max() > 0
+        ia.close()
+    islands = result["sara"]["islands"]
+    noise = result["sara"]["chosen"]["noise_jy_per_beam"]
+    assert all(0.2 < one["bootstrap_error_jy"] / noise < 10 and one["jackknife_error_jy"] > 0 for one in islands)
+    with np.load(name + ".draws.npz") as arrays:
+        assert arrays["shape"].tolist() == [64, 64] and len(arrays["scales"]) == 8
+    # stopped within the draws
+    from casa_sara.reconstruction.draws import Draws
+    from casa_sara.runtime.deadline import Deadline
+
+    stopped, made, add = str(tmp_path / "stopped"), [], Draws.add
+    monkeypatch.setattr(Draws, "add", lambda self, difference: made.append(add(self, difference)))
+    monkeypatch.setattr(Deadline, "near", lambda self: len(made) > 3)
+    options = dict(vis=vis, imagename=stopped, nterms=3, ndraws=8, jackknife=True, **GRID)
+    assert not tsara(**options)["sara"].get("draws", {}).get("made")
+    monkeypatch.undo()
+    tsara(restart=True, **options)
+    for suffix in (".model.error", ".image.error", ".image.jackknife"):
+        np.testing.assert_array_equal(pixels(stopped + suffix), pixels(name + suffix))
+
+
+@pytest.mark.slow
+def test_report_is_of_the_spectra(run, vis, tmp_path):
+    name = str(tmp_path / "told")
+    result = tsara(vis=vis, imagename=name, nterms=3, report=True, **GRID)
+    assert result["stopcode"] == run[0]["stopcode"]
+    measures = json.loads((tmp_path / "told.report/measures.json").read_text())
+    (product,) = measures["products"].values()
+    assert max(product["natural"]["chi_square"]) < 1.2
 
 
 def test_one_term_is_what_no_terms_are(vis, tmp_path):
@@ -371,9 +428,7 @@ def test_memory_and_time_are_forecast(vis, tmp_path):
     (dict(spectralindex=-0.7), "spectralindex = -0.7 with nterms = 2: either the index is known"),
     (dict(specmode="cube", reffreq=""), "nterms = 2 has no effect with specmode = 'cube'"),
     (dict(parallel=True), "parallel = True with nterms"),
-    (dict(report=True), "report = True with nterms"), (dict(ndraws=3), "ndraws = 3 with nterms"),
-    (dict(jackknife=True), "jackknife = True with nterms"), (dict(positivity=False), "positivity = False with nterms"),
-    (dict(savemodel="modelcolumn"), "savemodel = 'modelcolumn' with nterms"),
+    (dict(positivity=False), "positivity = False with nterms"),
     (dict(method="dabbech2018"), "method = 'dabbech2018' with nterms"),
     (dict(stokes="V", positivity=False), "stokes = 'V' with nterms")])
 def test_what_spectra_do_not_have_is_refused(vis, tmp_path, more, message):

@@ -38,6 +38,8 @@ class Product:
     primary_beams : dict
         Of mosaics, weighting → primary beam, NaN where nothing is compared; else empty. Models are the sky then, and
         residual and restored images the sky times the primary beam, NaN where that is.
+    polarised : complex ndarray or None
+        Q + iU of the model, Jy/pixel, where the image has these.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Product:
     region_errors: dict[str, float] = field(default_factory=dict)
     features: dict[str, tuple[dict[str, Any], np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=dict)
     primary_beams: dict[str, np.ndarray] = field(default_factory=dict)
+    polarised: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -78,8 +81,9 @@ class Comparison:
         {injected_jy, flux_jy, offset_arcsec, fwhm_arcsec, fwhm_in_beams → {weighting → ratio}}}, regions → {name →
         {flux_jy, error_jy, model_flux_jy, model_error_jy}}, features → {name → {flux_jy, delta_chi_square, drawn,
         p_value, rank_p_value, sigma}}, natural/briggs → {sigma, peak, dr, max_abs, skewness, kurtosis, whiteness,
-        chi_square → [of each block]}, truth → {snr, log_snr, ssim, ssim_range_jy_per_pixel, snr_at_scale →
-        {arcsec → dB}}} and
+        chi_square → [of each block]}, polarisation → as of
+        :func:`casa_sara.analysis.polarisation.polarised_measures`, truth → {snr, log_snr, ssim,
+        ssim_range_jy_per_pixel, snr_at_scale → {arcsec → dB}}} and
         `similarity` → weighting → {'one|other' → S in dB}; what could not be measured is left out.
     versions : dict
         Package → version.
@@ -88,6 +92,8 @@ class Comparison:
     frames : tuple of (str, ndarray, float)
         Title, model in Jy/pixel and pixel size in arcsec of reconstructions with different pixels, to be animated;
         pixel (nx//2, ny//2) of each is at `centre_deg`.
+    polarised_truth : complex ndarray or None
+        Q + iU of the truth, Jy/pixel, where its image has these.
     """
 
     products: tuple[Product, ...]
@@ -101,3 +107,4 @@ class Comparison:
     versions: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     frames: tuple[tuple[str, np.ndarray, float], ...] = ()
+    polarised_truth: np.ndarray | None = None

@@ -121,11 +121,11 @@ def _region(product: Product, mask, cell_arcsec, beams):
     for weighting in WEIGHTINGS:
         if weighting in product.restored:
             beam = metrics.beam_pixels(beams[weighting][:2], cell_arcsec)
-            image, rms, where = product.restored[weighting], np.nanstd(product.residual[weighting]), mask
+            image, rms = product.restored[weighting], np.nanstd(product.residual[weighting])
             if product.primary_beams:  # the flux of the sky, and its noise
-                pb, where = product.primary_beams[weighting], mask & np.isfinite(image)
-                image, rms = image / pb, rms * np.sqrt(np.mean(pb[where] ** -2.0))
-            flux, error = metrics.integrated_flux(image, where, "Jy/beam", beam, rms)
+                pb = product.primary_beams[weighting]
+                image, rms = image / pb, rms * np.sqrt(np.mean(pb[mask] ** -2.0))
+            flux, error = metrics.integrated_flux(image, mask, "Jy/beam", beam, rms)
             return {"flux_jy": flux, "error_jy": error, "model_flux_jy": model, "weighting": weighting}
     return {"flux_jy": model, "model_flux_jy": model}
 

@@ -16,6 +16,7 @@ from casa_sara.analysis.columns import Table
 from casa_sara.analysis.comparison import Comparison
 from casa_sara.analysis.cube_comparison import CubeComparison
 from casa_sara.analysis.folder import MEASURES, PAGE, replaced
+from casa_sara.analysis.polarisation import polarised_picture
 from casa_sara.analysis.sheets import DPI
 from casa_sara.analysis.tables import tables
 from casa_sara.analysis.zooms import find_zooms
@@ -167,6 +168,11 @@ def _sky(comparison, folder) -> list[Picture]:
         made.append(Picture(path, "sky", "Models, enlarged",
                             "The scale is that of the picture above." +
                             (" The ellipse is the finest CLEAN beam." if comparison.beams else "")))
+    path = folder / "polarisation.png"
+    if polarised_picture(path, comparison):
+        made.append(Picture(path, "sky", "Polarisation", "Polarised intensity of the models smoothed with the CLEAN "
+                            "beam, on one scale, and its angle where it is above five times the noise of the residual "
+                            "of Stokes I. The pictures and measures above are of Stokes I."))
     path = folder / "differences.png"
     if pages.differences(path, comparison):
         what = "the first product" if comparison.truth is None else "the truth"

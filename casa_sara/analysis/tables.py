@@ -38,7 +38,7 @@ def tables(comparison: Comparison) -> list[Table]:
     names = [product.name for product in comparison.products if product.name in measured]
     measured = {name: measured[name] for name in names}
     made = [_models(measured), *(_residuals(measured, weighting) for weighting in WEIGHTINGS), _blocks(measured),
-            *(_regions(measured, *of) for of in REGION_TABLES), _truth(measured),
+            _polarisation(measured), *(_regions(measured, *of) for of in REGION_TABLES), _truth(measured),
             _features(measured), _injected(measured, comparison.beams),
             _similarity(comparison.measures.get("similarity", {}))]
     return [table for table in made if table is not None]
@@ -74,6 +74,21 @@ def _models(measured):
         caption += (" Width of a point: full width at half maximum, in the model, of the brightest unresolved source "
                     "that stands alone in the truth.")
     return build("Models", columns, measured, caption)
+
+
+def _polarisation(measured):
+    entries = {name: entry["polarisation"] for name, entry in measured.items() if "polarisation" in entry}
+    columns = [
+        ("peak_jy_per_beam", "peak", "Jy/beam"),
+        ("intensity_jy", "intensity", "Jy"),
+        ("fraction", "fraction of I", ""),
+        ("snr", "SNR", "dB"),
+        ("angle_rms_deg", "angle, rms", "deg"),
+    ]
+    return build("Polarisation", columns, entries, "Of models smoothed with the CLEAN beam: peak of sqrt(Q^2 + U^2); "
+                 "its sum, and the fraction of Stokes I, where the reference is above ten times the noise of the "
+                 "residual; SNR of Q + iU, and rms of the difference of the angles there. The reference is the truth, "
+                 "where it has Q and U, else the first product that has.")
 
 
 def _residuals(measured, weighting):

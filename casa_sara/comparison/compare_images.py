@@ -13,8 +13,9 @@ from casa_sara.analysis import metrics
 from casa_sara.analysis.areas import Frame, places, region_masks
 from casa_sara.analysis.comparison import Comparison, Product
 from casa_sara.analysis.measuring import measure, source_support
+from casa_sara.analysis.polarisation import polarised_measures
 from casa_sara.casa.images.fits_files import is_fits
-from casa_sara.casa.images.image_sets import check_same_data, data_names, read_frames, read_image_set
+from casa_sara.casa.images.image_sets import check_same_data, data_names, read_frames, read_image_set, read_polarised
 from casa_sara.casa.images.sky_image import read_sky_image
 from casa_sara.casa.runtime import log
 from casa_sara.comparison.features import measures_of, test_features
@@ -87,21 +88,25 @@ def compare_images(request: Comparing, selection: Selection | None = None, singl
     if area is not None:
         models = {name: model * area for name, model in models.items()}
         truth = truth if truth is None else truth * area
-        _check_regions(regions, area)
+        regions = _within(regions, area)
     # measure
     products = tuple(product_of(one, models[one.name], residuals[one.name], beams, frame.cell_arcsec, primary_beams)
                      for one in sets)
-    products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec),
+    products = tuple(replace(product, **_errors(one, plane, regions, beams, frame.cell_arcsec, area),
+                             polarised=_polarised(one.polarised, plane),
                              features=_tested(one, features.get(one.name), of_features, plane, repeat))
                      for product, one in zip(products, sets))
     support = _support(request, plane, frame, list(models.values()), truth, next(iter(beams.values())), notes)
     measures = measure(products, frame.cell_arcsec, beams, truth, support, regions, chi_square)
+    polarised_truth = _polarised(read_polarised(request.truth, "truth"), plane) if request.truth else None
+    for name, entry in polarised_measures(products, frame.cell_arcsec, beams, polarised_truth).items():
+        measures["products"][name]["polarisation"] = entry
     if injected:
         _inject(injected, plane, request, selection, sets, beams, measures["products"])
     for note in notes:
         log.warn(note)
     return Comparison(products, frame.cell_arcsec, frame.centre_deg, beams, truth, support, regions, measures,
-                      versions(), tuple(notes), frames)
+                      versions(), tuple(notes), frames, polarised_truth)
 
 
 def versions():
@@ -168,12 +173,14 @@ def read_products(request, fewest, **options):
     return sets
 
 
-def _check_regions(regions, area):
-    """Raise where a region has nothing of what is compared of mosaics."""
-    for name, mask in regions.items():
-        if not (mask & area).any():
+def _within(regions, area):
+    """Return the regions within what is compared of mosaics; raise where one of them has nothing there."""
+    inside = {name: mask & area for name, mask in regions.items()}
+    for name, mask in inside.items():
+        if not mask.any():
             raise ValueError(f"regions: '{name}' lies where the primary beam of the mosaic is too low to compare: "
                              "should be within the mosaic")
+    return inside
 
 
 def _on_grid(image, plane, first, parameter, notes):
@@ -222,6 +229,11 @@ def product_of(one, model, residuals, beams, cell_arcsec, primary_beams=None):
                    primary_beams=primary_beams or {})
 
 
+def _polarised(images, plane):
+    """Return Q + iU on the common grid, complex (nx, ny) in Jy/pixel, None where there are none."""
+    return images["Q"].flux_on(plane) + 1j * images["U"].flux_on(plane) if images else None
+
+
 def _features(request, sets, observed):
     """Return the regions to test, by product and name, on its own pixels; raise where no run can be repeated."""
     again = [one for one in sets if observed and can_be_repeated(one)]
@@ -242,7 +254,7 @@ def _tested(one, features, masks, plane, repeat):
     return tested
 
 
-def _errors(one, plane, regions, beams, cell_arcsec):
+def _errors(one, plane, regions, beams, cell_arcsec, area):
     """Return the errors that a product's draws give: of the model, of the smoothed model and of regions."""
     if not one.draws:
         return {}
@@ -253,7 +265,8 @@ def _errors(one, plane, regions, beams, cell_arcsec):
                          f"{width} x {height}: should be of one run of tsara")
 
     def on_plane(difference):
-        return replace(one.model, pixels=difference).flux_on(plane)
+        flux = replace(one.model, pixels=difference).flux_on(plane)
+        return flux if area is None else flux * area
 
     def fluxes(difference):
         flux = on_plane(difference)

@@ -40,9 +40,10 @@ class Injection:
 
 
 def can_be_repeated(one) -> bool:
-    """Return whether the run of an ImageSet can be repeated: of tsara, with its parameters, no mask, no spectra."""
+    """Return whether the run of an ImageSet can be repeated: of tsara, Stokes I alone, no mask, no spectra."""
     masked = one.parameters.get("usemask", "user") != "user" or one.parameters.get("mask", "") not in ("", "[]", "['']")
-    return one.parameters.get("taskname") == "tsara" and not masked and not one.spectra
+    alone = one.parameters.get("stokes", "I") == "I"
+    return one.parameters.get("taskname") == "tsara" and not masked and not one.spectra and alone
 
 
 def spectral_index_of(one) -> str:

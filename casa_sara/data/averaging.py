@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from casa_sara.data.parts import Parts
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.runtime.scratch import IN_MEMORY, Scratch, slices
@@ -86,8 +87,8 @@ class Cells:
     ----------
     places : list of n float64 (M,) or Lazy
         Of the samples; the first coordinate is v ≥ 0.
-    sides : list of n float
-        Of the cells.
+    sides : list of n float or None
+        Of the cells; None where the places are whole numbers, each a cell.
     offsets : int (d + 1,)
         Block j is the slice offsets[j]:offsets[j + 1] of the samples.
     finer : int (d,)
@@ -108,7 +109,7 @@ class Cells:
         There are too many cells to number them.
     """
 
-    def __init__(self, places: Sequence[Sliced], sides: Sequence[float],
+    def __init__(self, places: Sequence[Sliced], sides: Sequence[float | None],
                  offsets: np.ndarray, finer: np.ndarray, comm: Serial = SERIAL, scratch: Scratch = IN_MEMORY) -> None:
         self._comm, self._scratch, self._of_samples = comm, scratch, offsets
         lattice = _Lattice.of(places, sides, offsets, finer, comm, scratch)
@@ -169,7 +170,7 @@ class _Lattice:
     """The cells of all blocks; `least` is the number of the first one along each axis, `spans` how many there are."""
 
     places: Sequence[Sliced]
-    sides: Sequence[float]
+    sides: Sequence[float | None]
     offsets: np.ndarray
     finer: np.ndarray
     scratch: Scratch
@@ -198,8 +199,11 @@ class _Lattice:
 
     def numbers(self, axis, piece):
         """Return the number of each sample's cell along an axis, int64."""
+        side = self.sides[axis]
+        if side is None:
+            return self.places[axis][piece].astype(np.int64)
         counts = np.diff(np.clip(self.offsets, piece.start, piece.stop))
-        number = np.repeat(np.exp2(self.finer) / self.sides[axis], counts)
+        number = np.repeat(np.exp2(self.finer) / side, counts)
         number *= self.places[axis][piece]
         return np.floor(number, out=number).astype(np.int64)
 
@@ -281,8 +285,12 @@ class Averaged:
         Of :class:`Cells`.
     comm : casa_sara.parallel.serial.Serial or MPI
         Over whose ranks the samples are spread.
+    parts : Parts or None
+        Of a mosaic: samples are averaged within their parts, around the middles of these.
     sum_of_weights : float64 (cells,)
         W.
+    part_of_cell : int (cells,) or None
+        Number of the part of each cell.
     samples : int (d,)
         How many samples each block has, on all ranks.
     """
@@ -294,15 +302,20 @@ class Averaged:
     operator: Any
     finer: np.ndarray
     comm: Serial = SERIAL
+    parts: Parts | None = None
 
     def __post_init__(self):
         self.sum_of_weights = self.cells.sums(self.data.weight)
+        self.part_of_cell: np.ndarray | None = None
+        self._turn: np.ndarray | None = None
+        if self.parts is not None:
+            self.part_of_cell = np.rint(self.weighted_mean(self.parts.number)).astype(int)
         self.samples = self.comm.exscan(np.diff(self.offsets))[1]
 
     @classmethod
-    def of(cls, data: Visibilities, offsets: np.ndarray, sides: np.ndarray, finer: np.ndarray,
+    def of(cls, data: Visibilities, offsets: np.ndarray, sides: np.ndarray, finer: np.ndarray,  # noqa: PLR0913 - two
            vis: np.ndarray | None, operator: Any,
-           comm: Serial = SERIAL) -> tuple[Averaged, np.ndarray, np.ndarray | None]:
+           comm: Serial = SERIAL, parts: Parts | None = None) -> tuple[Averaged, np.ndarray, np.ndarray | None]:
         """Average the samples of a problem.
 
         Parameters
@@ -312,10 +325,10 @@ class Averaged:
         offsets : int (d + 1,)
             Block j is the slice offsets[j]:offsets[j + 1].
         sides : float (4,)
-            Of :func:`cell_sides`.
+            Of :func:`cell_sides`; the first two are those of the parts where there are some.
         finer : int (d,)
             The cells of block j are 2^finer[j] times smaller than these.
-        vis, operator, comm
+        vis, operator, comm, parts
             As of the class.
 
         Returns
@@ -327,14 +340,22 @@ class Averaged:
             Geometric mean of the frequencies, where the samples have some.
         """
         places: list[Sliced] = [_place(data, axis) for axis in ((1, 0, 2) if np.isfinite(sides[2]) else (1, 0))]
+        chosen = [sides[0], sides[1], *sides[2:3][np.isfinite(sides[2:3])]]
+        if parts is not None:
+            places, chosen = [Lazy(parts.place(1)), Lazy(parts.place(0)), parts.number], [1.0, 1.0, None]
         freqs = data.freq_hz
         if freqs is not None:
             places.append(Lazy(lambda piece: np.log(freqs[piece], dtype=float)))
-        chosen = [sides[0], sides[1], *sides[2:3][np.isfinite(sides[2:3])], *sides[3:][:freqs is not None]]
+            chosen.append(sides[3])
         cells = Cells(places, chosen, offsets, finer, comm, data.scratch)
-        averaged = cls(cells, data, vis, offsets, operator, finer, comm)
+        averaged = cls(cells, data, vis, offsets, operator, finer, comm, parts)
         v, u, *others = (averaged.weighted_mean(place) for place in places)
         freq_hz = None if freqs is None else np.exp(others.pop())
+        if parts is not None:
+            number = averaged.part_of_cell
+            assert number is not None
+            u, v = np.array([u, v]) * parts.sides[number].T
+            averaged._turn, others = parts.turn_of(np.array([u, v]), number), []
         return averaged, np.array([u, v, *(others or [np.zeros_like(u)])]), freq_hz
 
     def weighted_mean(self, values: Sliced) -> np.ndarray:
@@ -364,10 +385,16 @@ class Averaged:
         complex (cells,)
         """
         weight, v, sums = self.data.weight, self.data.uvw[1], self.cells.sums
+        straight = vis
+        if self.parts is not None:
+            parts, v = self.parts, self.parts.uv[1]
+            straight = Lazy(lambda piece: parts.straight(vis[piece], piece))
         norm = 1 / np.sqrt(self.sum_of_weights)
         mean = np.empty(self.cells.size, np.result_type(vis[:0]))
-        mean.real = sums(Lazy(lambda piece: np.sqrt(weight[piece]) * vis[piece].real)) * norm
-        mean.imag = sums(Lazy(lambda piece: np.sqrt(weight[piece]) * _fold(v[piece]) * vis[piece].imag)) * norm
+        mean.real = sums(Lazy(lambda piece: np.sqrt(weight[piece]) * straight[piece].real)) * norm
+        mean.imag = sums(Lazy(lambda piece: np.sqrt(weight[piece]) * _fold(v[piece]) * straight[piece].imag)) * norm
+        if self._turn is not None:
+            mean *= self._turn
         return mean
 
     @property

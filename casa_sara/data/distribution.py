@@ -211,7 +211,7 @@ def _joined(parts):
     rows = {name: np.concatenate([getattr(part.rows, name) for part in parts])
             for name in RowTable.__dataclass_fields__}
     samples = {name: np.concatenate([getattr(part, name) for part in parts], axis=-1)
-               for name in ("vis", "weight", "imaging_weight", "uvw", "chan", "freq_hz")
+               for name in ("vis", "weight", "imaging_weight", "uvw", "chan", "freq_hz", "beam")
                if getattr(parts[0], name) is not None}
     row = np.concatenate([begin + part.row for begin, part in zip(begins, parts)])
     return replace(parts[0], rows=RowTable(**rows), row=row.astype(np.int32), **samples)

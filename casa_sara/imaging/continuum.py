@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from casa_sara.casa.images.image_files import read_model
-from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, read_pixels
+from casa_sara.casa.images.image_files import read_model, read_spectra
+from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, read_pixels, relative_pb
 from casa_sara.casa.images.masks import read_support
 from casa_sara.casa.images.products import write_images, write_products
 from casa_sara.casa.images.restore import restored_beam
@@ -57,7 +58,7 @@ from casa_sara.imaging.run_solver import (
     solve_image,
     without_wild,
 )
-from casa_sara.imaging.spectra import divided_by_band, spectral_images, with_subbands
+from casa_sara.imaging.spectra import divided_by_band, seen_draws, spectral_images, with_subbands
 from casa_sara.imaging.time_forecast import Pace, error_seconds, writing_seconds
 from casa_sara.imaging.total_power import total_power
 from casa_sara.operators.outliers import rotation, stacked
@@ -173,7 +174,7 @@ def make_image(request: ImagingRequest, record: Callable[[Result], dict] | None 
     if comm.bcast(result.finished or not checkpoint.stands):  # else one of an older run
         comm.once(checkpoint.remove)
     if output.savemodel == "modelcolumn":
-        comm.once(save_model, request.selection, solution.part.data, plane.grid, request.options, solution.stacked)
+        comm.once(save_model, request.selection, solution.part.data, plane.grid, request.options, solution.seen)
     return result
 
 
@@ -253,14 +254,14 @@ def read_data(request, ranks, scratch):
     data = read_visibilities(request.selection, grid.phasecenter, grid.stokes, frequencies, ranks, scratch)
     data.notes.extend(check_pointings(data, grid))
     if grid.is_mosaic:
-        data, grid = with_beams(data, request.selection, grid)
+        data, grid = with_beams(data, request.selection, grid, comm)
     data.notes.extend(image_limits(data, grid, comm))
     plane = comm.once(define_image_plane, data, request.selection, grid, output.pblimit)
     grid = with_turns(grid, data)
     outliers = outlier_planes(request, data, grid)
     if grid.is_mosaic:
         weights = imaging_weights(data, grid, request.weighting, comm)
-        plane = plane.of_mosaic(weight_image(data, grid, weights), output.pblimit)
+        plane = plane.of_mosaic(weight_image(data, grid, weights, comm), output.pblimit)
     dish = total_power(request.single_dish, data, plane, grid)
     data.notes.extend(plane.notes)
     if not plane.mask.any():
@@ -287,8 +288,11 @@ def _startmodel(output, plane, stokes):
 
 def _complete(request, plane, data, forecast, comm):
     """Write the model column that a finished run has not written any more; its images stand."""
-    model = plane.startmodel
-    comm.once(save_model, request.selection, data, plane.grid, request.options, model)
+    model = seen = plane.startmodel
+    spectra = request.output.imagename + ".subbands"
+    if plane.grid.subbands is not None and os.path.exists(spectra):
+        _, seen = read_spectra(spectra)
+    comm.once(save_model, request.selection, data, plane.grid, request.options, seen)
     peak = comm.once(_peak, request.output.imagename + ".residual")
     return Result(data, comm.total(data.size), [], np.zeros(0), None, peak, float(model.sum(dtype=float)),
                   forecast.summary())
@@ -344,8 +348,10 @@ def _look_back(images, plane, solution, comm):
 def _write(request, plane, images, solution, record, child):
     """Write the products, with the errors that the draws give."""
     reconstruction = solution.reconstruction
-    draws, jackknife = (reconstruction.draws, reconstruction.jackknife) if reconstruction else (None, None)
-    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad)
+    draws, jackknife = seen_draws(reconstruction, plane.grid) if reconstruction else (None, None)
+    weight = images.pixels.get("weight")
+    pb = None if weight is None else relative_pb(weight)
+    errors = error_images(draws, jackknife, images.beam, request.output.restoringbeam, plane.grid.cell_rad, pb)
     if "model.error" in errors:
         errors["draws"] = draws.arrays()
     if reconstruction and reconstruction.spectra is not None:

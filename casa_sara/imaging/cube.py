@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from casa_sara.casa.images.products import check_imagename, write_images, write_products
 from casa_sara.casa.ms.read import read_visibilities
@@ -14,7 +14,7 @@ from casa_sara.imaging.cube_checkpoint import CubeCheckpoint
 from casa_sara.imaging.cube_planes import Channel, CubePlanes, Tally
 from casa_sara.imaging.data_quality import image_limits
 from casa_sara.imaging.dry_run import forecast_run
-from casa_sara.imaging.mosaic import check_pointings
+from casa_sara.imaging.mosaic import check_pointings, with_beams
 from casa_sara.imaging.predict_model import save_model
 from casa_sara.imaging.run_solver import checkpoint_of
 from casa_sara.imaging.time_forecast import writing_seconds
@@ -23,7 +23,15 @@ from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.compile_cache import kernels_loading
 from casa_sara.runtime.deadline import Deadline
 from casa_sara.runtime.signals import stop_on_interrupt
-from casa_sara.solver.record import CONVERGED, EMPTY_MASK, ITERATION_LIMIT, NOISE_ONLY, STOPPED_BY_USER, UNFINISHED
+from casa_sara.solver.record import (
+    CONVERGED,
+    EMPTY_MASK,
+    ITERATION_LIMIT,
+    NOISE_ONLY,
+    STOPPED_BY_USER,
+    TIME_LIMIT,
+    UNFINISHED,
+)
 
 __all__ = ["CubeResult", "make_cube"]
 
@@ -75,10 +83,15 @@ def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | No
         comm.together(checkpoint.open)
     # read
     with kernels_loading(log.info):
-        data = comm.together(read_visibilities, request.selection, grid.phasecenter, grid.stokes)
+        data = comm.together(read_visibilities, request.selection, grid.phasecenter, grid.stokes,
+                             grid.needs_frequencies)
+    if grid.is_mosaic:
+        data, grid = comm.together(with_beams, data, request.selection, grid)
+        request = replace(request, grid=grid)
     data.notes.extend(check_pointings(data, grid) + image_limits(data, grid))
     cube = CubePlanes.of(request, data, forecast.workload.channels, comm)
-    comm.once(check_imagename, output.imagename, cube.plane.pb.shape, 2 * output.pbcor + grid.masked)
+    comm.once(check_imagename, output.imagename, cube.plane.pb.shape, 2 * output.pbcor + grid.masked
+              + 2 * bool(request.options.ndraws) + request.options.jackknife)
     for note in data.notes:
         log.warn(note)
     # the dirty cube: errors of weights and beams are raised before the long part
@@ -87,7 +100,7 @@ def make_cube(request: ImagingRequest, record: Callable[[CubeResult], dict] | No
     stopped = 0
     if request.options.niter > 0:
         comm.together(checkpoint.identify, visibilities=data.vis, weights=data.weight, uvw=data.uvw,
-                      channels=cube.order, support=cube.support)
+                      channels=cube.order, support=cube.support, beam=data.beam)
         deadline.reserve = cube.plane.channels * writing_seconds(0, grid.shape) + after_iterations(
             data.size, (0,), output, request.limits, deadline.elapsed())
         stopped = comm.largest(_solve_channels(cube, checkpoint, deadline, comm))
@@ -144,6 +157,11 @@ def _solve_own(cube, own, checkpoint, watch, pressed):
             code = reconstruction.record.stop_code
             if code in UNFINISHED:
                 code = reconstruction.record.stop_code = watch.asked() or code
+            elif not reconstruction.finished:  # all but its draws
+                code = watch.asked() or (STOPPED_BY_USER if pressed() else TIME_LIMIT)
+            else:
+                code = 0
+            if code:
                 cube.take(k, reconstruction)
                 if not of_channel.kept:
                     checkpoint.keep(-1, lambda: None, 0, now=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from casa_sara.casa.runtime import log
 from casa_sara.parallel.serial import SERIAL
+from casa_sara.reconstruction.draws import Draws
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.state_file import CheckpointError, digest
 
@@ -106,8 +107,9 @@ class CubeCheckpoint:
     def keep(self, channel, make_solution, iteration, now=False):
         """Write the finished channels, and the state of the solution of another, when it is time or `now`."""
         def state():
-            finished = {str(number): vars(one) | dict(record=one.record.state())
-                        for number, one in self.finished.items()}
+            finished = {str(number): vars(one) | dict(record=one.record.state()) | {
+                name: draws and draws.arrays() for name, draws in (("draws", one.draws), ("jackknife", one.jackknife))}
+                for number, one in self.finished.items()}
             return dict(finished=finished, channel=channel, solution=make_solution())
 
         self.file.keep(state, iteration, now)
@@ -164,6 +166,7 @@ def _numbered(checkpoint, number):
 
 def _reconstruction(state):
     """Return a finished solution."""
-    solved = Reconstruction.of(state)
+    drawn = {name: state[name] and Draws.of(state[name]) for name in ("draws", "jackknife")}
+    solved = Reconstruction.of(state | drawn)
     solved.record.resumed.pop()  # it was finished, not resumed
     return solved

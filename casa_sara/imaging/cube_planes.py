@@ -7,21 +7,25 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from casa_sara.casa.images.image_files import read_model
-from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane
+from casa_sara.casa.images.image_plane import ImagePlane, define_image_plane, relative_pb
 from casa_sara.casa.images.masks import read_support
 from casa_sara.casa.images.spectral_axis import SpectralAxis, channels_of
+from casa_sara.casa.ms.weights import imaging_weights
 from casa_sara.casa.runtime import log
 from casa_sara.data.visibilities import Visibilities
 from casa_sara.imaging.continuum import Result, describe, split
 from casa_sara.imaging.data_quality import check_confined, left_outside, nowhere_visible, thermal_noise
+from casa_sara.imaging.error_images import error_images
 from casa_sara.imaging.island_list import list_islands
+from casa_sara.imaging.mosaic import weight_image
 from casa_sara.imaging.plane_images import plane_images
-from casa_sara.imaging.run_solver import Watch, density_of, solve_image, without_wild
+from casa_sara.imaging.run_solver import Watch, density_of, expected_iterations, solve_image, without_wild
 from casa_sara.imaging.time_forecast import Pace
 from casa_sara.options import ImagingRequest
 from casa_sara.parallel.serial import SERIAL
+from casa_sara.reconstruction.bootstrap import jackknife_groups
 from casa_sara.reconstruction.problem import Samples
-from casa_sara.reconstruction.settings import check_l2bound, schedule_of
+from casa_sara.reconstruction.settings import check_l2bound
 
 __all__ = ["Channel", "CubePlanes", "Tally"]
 
@@ -73,8 +77,6 @@ class CubePlanes:
         """Lay out the axis and sort the samples by channel; there are no images yet."""
         plane = comm.once(define_image_plane, data, request.selection, request.grid, request.output.pblimit, planes)
         data.notes.extend(plane.notes)
-        if not plane.mask.any():
-            data.notes.append(nowhere_visible(request.grid, request.output))
         axis = SpectralAxis.of(plane)
         channel = channels_of(data, request.selection, axis)
         order = np.argsort(channel, kind="stable")
@@ -89,14 +91,20 @@ class CubePlanes:
             data.notes.append(f"channels {numbers} are blank: they have no usable visibilities")
         if first[0]:
             log.info(f"{first[0]} visibilities are in none of the {axis.size} image channels")
+        if request.grid.is_mosaic:
+            plane = plane.of_mosaic(_weight_cube(request, data, order, first), request.output.pblimit)
         plane = replace(plane, mask=plane.mask & ~blank[:, None, None])
+        if not plane.mask.any():
+            data.notes.append(nowhere_visible(request.grid, request.output))
         support = None if request.output.images_stand else comm.once(read_support, request.grid, plane)
         closed = np.zeros(axis.size, bool) if support is None else ~support.any(axis=(1, 2))
         if (closed & ~blank).any():
             numbers = ", ".join(map(str, np.flatnonzero(closed & ~blank)))
             data.notes.append(f"the mask is empty in channels {numbers}: their models are zero")
         channels = [Channel(float(freq), closed=bool(shut)) for freq, shut in zip(axis.freqs_hz, closed)]
-        images = {name: np.zeros(plane.pb.shape, np.float32) for name in ("psf", "residual", "model")}
+        names = () if request.output.images_stand else _error_names(request)
+        names = ("psf", "residual", "model", *names, *["weight"] * request.grid.is_mosaic)
+        images = {name: np.zeros(plane.pb.shape, np.float32) for name in names}
         return cls(request, data, plane, axis, order, first, channels, support, images)
 
     @property
@@ -121,6 +129,8 @@ class CubePlanes:
             part = self._split(k)
             describe(part.data, part.blocks, part.noise, self.request.grid.stokes)
             check_l2bound(self.request.options, len(part.blocks))
+            if self.request.options.jackknife:
+                jackknife_groups(len(part.blocks))
             self._fill(k, part.data, part.blocks, part.noise, None, model)
         except ValueError as error:
             raise ValueError(f"channel {k}, {self.channels[k].freq_hz / 1e9:.9g} GHz: {error}") from error
@@ -131,7 +141,7 @@ class CubePlanes:
         part, request = self._split(k), self.request
         density = density_of(part.data, None, request.grid, request.options)
         samples = Samples(part.data, part.offsets, density, part.noise)
-        watch = Watch(deadline, Pace(schedule_of(request.options).expected_iterations), checkpoint)
+        watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
         start, support = self._startmodel(k), None if self.support is None else self.support[k]
         if start is not None and support is not None:
             start *= support
@@ -143,9 +153,17 @@ class CubePlanes:
         list_islands(reconstruction.record, self.plane, request.grid.cell_rad, request.options.significance)
         data, blocks = without_wild(part.data, part.blocks, part.offsets, reconstruction)
         weights = self._fill(k, data, blocks, part.noise, reconstruction, reconstruction.model)
+        weight = self.images["weight"][k] if request.grid.is_mosaic else None
+        errors = error_images(reconstruction.draws, reconstruction.jackknife, self.channels[k].beam,
+                              request.output.restoringbeam, request.grid.cell_rad,
+                              None if weight is None else relative_pb(weight))
+        for name, image in errors.items():
+            self.images[name][k] = image
         if self.support is not None:
             check_confined(reconstruction.model, self.support[k])
             sigma = thermal_noise(data, weights, part.noise, np.searchsorted(reconstruction.kept, part.offsets))
+            if weight is not None:  # of flat noise
+                sigma /= float(weight.max()) ** 0.5
             for note in left_outside(self.images["residual"][k], self.support[k], sigma):
                 log.warn(f"channel {k}: {note}")
                 self.found.append(f"channel {k}: {note}")
@@ -202,3 +220,23 @@ class CubePlanes:
         channel.result = Result(Tally(data.size, data.dropped), data.size, blocks, noise, reconstruction,
                                 found.residual_peak, found.model_flux, {})
         return found.weights
+
+
+def _weight_cube(request, data, order, first):
+    """Return the weight of the data of a mosaic at each place of the sky, float32 (nchan, nx, ny), 0 without data."""
+    grid, middle = request.grid, tuple(n // 2 for n in request.grid.shape)
+    cube = np.zeros((len(first) - 1, *grid.shape), np.float32)
+    for k in np.flatnonzero(np.diff(first)).tolist():
+        part = data.part(order[first[k] : first[k + 1]])
+        if not grid.mosaic.sensitivity(grid.mosaic.sums(part.beam, part.weight))[middle] > 0:
+            raise ValueError(f"phasecenter = '{grid.phasecenter}': in channel {k} no pointing sees the centre of the "
+                             "image: should be a direction within the mosaic, or channels that have data there")
+        cube[k] = weight_image(part, grid, imaging_weights(part, grid, request.weighting))
+    return cube
+
+
+def _error_names(request):
+    """Return the names of the images of errors that were asked for."""
+    options, restored = request.options, request.output.restoringbeam is not None
+    return ["model.error"] * bool(options.ndraws) + ["image.error"] * (bool(options.ndraws) and restored) + [
+        "image.jackknife"] * (options.jackknife and restored)

@@ -15,7 +15,7 @@ ARCSEC = np.radians(1 / 3600)
 
 
 def error_images(draws: Draws | None, jackknife: Draws | None, fitted: dict, restoringbeam: tuple[str, ...] | None,
-                 cell_rad: tuple[float, float]) -> dict[str, np.ndarray]:
+                 cell_rad: tuple[float, float], pb: np.ndarray | None = None) -> dict[str, np.ndarray]:
     """Return the error of the model, and those of the model smoothed to the restoring beam.
 
     Parameters
@@ -28,6 +28,8 @@ def error_images(draws: Draws | None, jackknife: Draws | None, fitted: dict, res
         As of :class:`casa_sara.options.Output`.
     cell_rad : (float, float)
         Pixel size.
+    pb : real (nx, ny), optional
+        Primary beam of a mosaic, whose draws are of the sky, and whose restored image is the sky times that.
 
     Returns
     -------
@@ -42,6 +44,9 @@ def error_images(draws: Draws | None, jackknife: Draws | None, fitted: dict, res
         *axes, angle = beam_numbers(restored_beam(list(restoringbeam), fitted))
         cell = tuple(size / ARCSEC for size in cell_rad)
         per_beam = beam_pixels(axes, cell)
-        errors |= {f"image.{name}": one.error(lambda difference: per_beam * smooth(difference, axes, angle, cell))
-                   for name, one in drawn.items()}
+
+        def restored(difference):
+            return per_beam * smooth(difference if pb is None else difference * pb, axes, angle, cell)
+
+        errors |= {f"image.{name}": one.error(restored) for name, one in drawn.items()}
     return errors

@@ -34,7 +34,7 @@ def solver_samples(volume, grid, options):
     More averages than pixels there are only where cells are not enlarged any more, and more than half of the samples
     never.
     """
-    averages = options.averages and not grid.is_mosaic and grid.nterms == 1
+    averages = options.averages and grid.nterms == 1
     return min(volume.samples // 2, math.prod(grid.shape)) if averages else volume.samples
 
 

@@ -29,6 +29,7 @@ SOLVER = 48  # whitened data, density, preconditioner, dual, Φx̄, Φz, weights
 PASSING = 12  # weights of a pass between the iterations
 # where visibilities are averaged; the averages have an operator of their own
 AVERAGED = 16  # of all: whitened, the numbers of their cells, the density
+PARTS = 28  # of all, of a mosaic: place and phase in the part of the image that it sees
 AVERAGE = 72  # of an average: that of SOLVER, POINT and the sums of its cell
 RENEWING = 24  # of all: residual and its sums
 # samples on the disk: of each, of each of the largest block, and of each of a piece that is worked on
@@ -46,7 +47,7 @@ ERRORS = 10  # images of errors, and of the smoothing
 MIXED, INDEXED = 2, 8  # of each image where several frequencies are solved for; of their smoothed ones
 TURNED = 8  # bytes of a sample of each outlier: its rotation, and once what an image contributes
 CONTRIBUTED = 8  # bytes of a sample, of each of these
-CUBES = 3  # psf, residual and model of each channel
+CUBES, CUBES_OF_ERRORS = 3, 3  # psf, residual and model of each channel; its images of errors
 MASK = 1.25  # of each channel of a cube, as it is used and as it is written
 DENSITY_CELL = 25  # bytes of one uv cell, in CASA's imager
 LIBRARIES = 90_000_000  # compiled code and libraries that come with the first run
@@ -86,7 +87,8 @@ class Workload:
     blocks: int = 0  # asked for; 0 for those of the automatic rule
     nterms: int = 1  # images that are solved for together
     outliers: tuple[tuple[int, int], ...] = ()  # shapes of small images beside this one
-    stokes: int = 1  # Stokes parameters that are solved side by side
+    stokes: int = 1  # Stokes parameters
+    together: int = 1  # of these, as many as are solved side by side
 
     @classmethod
     def of(cls, volume, grid, options, report=False, band=0.0, ranks=ALONE):
@@ -103,7 +105,8 @@ class Workload:
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2,
-                   averages=options.averages and not grid.is_mosaic, nterms=grid.nterms, stokes=len(grid.stokes),
+                   averages=options.averages, nterms=grid.nterms, stokes=len(grid.stokes),
+                   together=max(1, len(grid.stokes) - 1) if options.polbound and grid.stokes[0] == "I" else 1,
                    outliers=grid.shapes[1:])
 
     def memory(self):
@@ -115,25 +118,29 @@ class Workload:
         return self._of_cube() if self.channels else self._of_plane()
 
     def _of_stokes(self):
-        """The phases of several Stokes parameters, of which each has all that one alone has of its own."""
+        """The phases of several Stokes parameters: those solved side by side have all that one alone has of its own."""
         shared = ("libraries", "visibilities", "while reading", "uv grid", "while planning", "wavelet workspace")
-        further = {"further Stokes parameters": STOKES * (self.stokes - 1) * self.samples}
-        return {phase: {part: size * (1 if part in shared else self.stokes) for part, size in parts.items()} | further
-                for phase, parts in replace(self, stokes=1).memory().items()}
+        further = {"further Stokes parameters": STOKES * (self.stokes - 1) * self.samples,
+                   "their models and residuals": self._planes(2 * self.stokes + 2)}
+        return {phase: {part: size * (1 if part in shared else self.together) for part, size in parts.items()} | further
+                for phase, parts in replace(self, stokes=1, together=1).memory().items()}
 
     def _of_cube(self):
         """The phases of the fullest channel, beside all data and the cubes; all is read and written at once."""
         one = replace(self, samples=math.ceil(self.samples * self.share), channels=0).memory()
         one.pop("reading")
         writing = one.pop("writing")
+        cubes = CUBES + (self.gridder == "mosaic") + CUBES_OF_ERRORS * bool(self.draws)
         held = {"visibilities of all channels": (SAMPLE + SORTING) * self.samples,
-                "cubes": self._planes((PLANE + CUBES + MASK * self.masked) * self.channels)}
+                "cubes": self._planes((PLANE + cubes + MASK * self.masked) * self.channels)}
+        if self.draws:
+            held["draws of all channels"] = self._drawn() * self.channels
         reading = {"libraries": LIBRARIES, "visibilities": SAMPLE * self.samples,
                    "while reading": READING * self.samples}
         return {"reading": reading, **{phase: parts | held for phase, parts in one.items()},
                 "images of a channel": writing | held,
                 "writing": {"libraries": LIBRARIES, **held,
-                            "process that writes": self._planes((PLANE + CUBES + MASK * self.masked + 1)
+                            "process that writes": self._planes((PLANE + cubes + MASK * self.masked + 1)
                                                                 * self.channels)}}
 
     def _on_disk(self):
@@ -203,7 +210,8 @@ class Workload:
         if not self.averages:
             return {"solver's visibilities": SOLVER * self.samples}
         most = math.ceil(WORTHWHILE * self.samples)
-        return {"solver's visibilities": AVERAGED * self.samples + AVERAGE * most + self._grid()
+        of_each = AVERAGED + PARTS * (self.gridder == "mosaic")
+        return {"solver's visibilities": of_each * self.samples + AVERAGE * most + self._grid()
                 + further_bytes(most, self, self.max_w, self.band) + self._spectra(most) + self._elsewhere(most)}
 
     def _writing(self, with_operator):
@@ -247,7 +255,7 @@ class Workload:
 
     def _drawn(self):
         """Bytes of the draws."""
-        return self._planes(DRAW * self.draws * (DRAWN_PART if self.confined else 1.0))
+        return self._planes(DRAW * self.draws * self.nterms * (DRAWN_PART if self.confined else 1.0))
 
     def _side(self):
         cell = min(self.cell_rad)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from casa_sara.data.visibilities import Visibilities
 from casa_sara.operators.beams import Beam, Mosaic
 from casa_sara.operators.mosaic import remaining_w_phase
 from casa_sara.operators.sky import sky_operator
+from casa_sara.parallel.serial import SERIAL
 
 __all__ = ["MosaicModel", "beams_record", "check_pointings", "flat_noise", "predicted", "w_note", "weight_image",
            "with_beams"]
@@ -57,7 +59,7 @@ def check_pointings(data, grid):
     return [f"{apart}, are imaged as one pointing: their different primary beams are not modelled"]
 
 
-def with_beams(data, selection, grid):
+def with_beams(data, selection, grid, comm=SERIAL):
     """Find the primary beams of the samples, and leave out the samples that see nothing of the image.
 
     Parameters
@@ -68,6 +70,8 @@ def with_beams(data, selection, grid):
         Of the data.
     grid : casa_sara.options.ImageGrid
         Size, pixels and direction of the image.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
 
     Returns
     -------
@@ -81,16 +85,16 @@ def with_beams(data, selection, grid):
     ValueError
         The beams are not known, or no pointing sees the centre of the image.
     """
-    found = primary_beams(data, selection, grid)
+    found = primary_beams(data, selection, grid, comm=comm)
     log.info(found.words)
     mosaic, beam = _mosaic(found, grid)
     data = replace(data, beam=beam)
     kept = np.flatnonzero(beam >= 0)
-    if kept.size < data.size:
-        beyond = data.size - kept.size
+    if beyond := comm.total(data.size - kept.size):
         note = f"{beyond} visibilities are of pointings that see nothing of the image, and are left out"
         data = replace(data.part(kept), dropped=data.dropped | {"beyond the image": beyond}, notes=[*data.notes, note])
-    seen = mosaic.sensitivity(mosaic.sums(data.beam, data.weight)) if data.size else np.zeros(grid.shape)
+    sums = comm.allreduce(mosaic.sums(data.beam, data.weight))
+    seen = mosaic.sensitivity(sums) if sums.any() else np.zeros(grid.shape)
     if not seen[grid.shape[0] // 2, grid.shape[1] // 2] > 0:
         raise ValueError(f"phasecenter = '{grid.phasecenter}': no pointing sees the centre of the image: should be a "
                          "direction within the mosaic")
@@ -142,10 +146,13 @@ class MosaicModel:
         Of :func:`beams_record`, as it comes out of JSON.
     accuracy : dict
         `eps` and `nthreads` of the operator.
+    axis : casa_sara.casa.images.spectral_axis.SpectralAxis, optional
+        Of a cube, whose `model` is (nchan, nx, ny).
     """
 
-    def __init__(self, model, grid, selection, phase_center, beams, accuracy):
+    def __init__(self, model, grid, selection, phase_center, beams, accuracy, axis=None):
         self._model, self._grid, self._selection, self._accuracy = model, grid, selection, accuracy
+        self._axis = axis
         fields = {(int(ms), int(field)): direction for ms, field, direction in beams["fields"]}
         self._profiles = Profiles(np.asarray(beams["bands_hz"]), [tuple(kind) for kind in beams["kinds"]],
                                   np.asarray(beams["radii"]), np.asarray(beams["values"]))
@@ -170,7 +177,14 @@ class MosaicModel:
             return vis
         row = np.repeat(np.arange(rows.ms.size), count // rows.ms.size)
         data = Visibilities(vis=vis, weight=np.ones(count), uvw=uvw, row=row, rows=rows, freq_hz=freq_hz, **self._where)
-        return predicted(self._model, data, self._selection, self._grid, self._profiles, **self._accuracy)
+        of = partial(predicted, selection=self._selection, grid=self._grid, profiles=self._profiles, **self._accuracy)
+        if self._axis is None:
+            return of(self._model, data)
+        channel = self._axis.nearest(freq_hz)
+        for k in np.unique(channel[channel >= 0]):
+            here = np.flatnonzero(channel == k)
+            vis[here] = of(self._model[k], data.take(here))
+        return vis
 
 
 def predicted(model, data, selection, grid, profiles, **accuracy):
@@ -201,16 +215,16 @@ def predicted(model, data, selection, grid, profiles, **accuracy):
     return vis
 
 
-def w_note(data, mosaic, largest):
+def w_note(max_w, mosaic, largest):
     """Return the warning about the w-term that a mosaic leaves out, where it is more than `largest` rad."""
-    phase = remaining_w_phase(data.max_w, mosaic)
+    phase = remaining_w_phase(max_w, mosaic)
     if phase <= largest:
         return []
     return ["the w-term is modelled to first order around each pointing: what is left out changes phases by up to "
             f"{phase:.2g} rad at the edges of the primary beams; gridder = 'wproject' models it, for single pointings"]
 
 
-def weight_image(data, grid, weights):
+def weight_image(data, grid, weights, comm=SERIAL):
     """Return Σ_g W_g A_g²/Σw, the weight of the data at each place of the sky, as tclean's .weight of a mosaic.
 
     Parameters
@@ -221,12 +235,15 @@ def weight_image(data, grid, weights):
         With its mosaic.
     weights : real (M,)
         w; W_g is their sum over the samples of beam g.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
 
     Returns
     -------
     float32 (nx, ny)
     """
-    return grid.mosaic.power(grid.mosaic.sums(data.beam, weights)) / np.float32(weights.sum(dtype=float))
+    sums = comm.allreduce(grid.mosaic.sums(data.beam, weights))
+    return grid.mosaic.power(sums) / np.float32(comm.total(float(weights.sum(dtype=float))))
 
 
 def flat_noise(dirty, weight):

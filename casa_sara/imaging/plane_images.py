@@ -76,7 +76,7 @@ def plane_images(data, model, grid, weighting, options, plane, comm=SERIAL):
     residual = dirty_image(operator, left, weights, comm)
     pixels = dict(psf=psf, residual=residual, model=model)
     if grid.is_mosaic:
-        pixels["weight"] = weight_image(data, grid, weights)
+        pixels["weight"] = weight_image(data, grid, weights, comm)
         pixels["residual"] = flat_noise(residual, pixels["weight"])
     if grid.is_cube and weighting.weighting == "uniform":  # tclean's density of a channel counts the correlations, too
         sumwt = float(weights.sum(dtype=float))

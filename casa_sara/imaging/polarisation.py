@@ -103,7 +103,7 @@ def make_polarised(request: ImagingRequest, record: Callable[[PolarisedResult], 
         parts = [replace(part, data=one, noise=noise_from_differences(one, part.offsets) if number else part.noise)
                  for number, one in enumerate(part.data.of_stokes(k) for k in range(len(grid.stokes)))]
         _check(request, plane, parts)
-        watch = Watch(deadline, Pace(expected_iterations(request.options)), checkpoint)
+        watch = Watch(deadline, Pace(len(parts) * expected_iterations(request.options)), checkpoint)
         found = _solve(request, plane, parts, watch)
         result, images, beam = _images(request, plane, parts, found)
         assert watch.pace is not None
@@ -135,7 +135,7 @@ def _solve(request, plane, parts, watch):
                                               watch.deadline.elapsed())
     density = density_of(first, request.selection, grid, options)
     progress = log.Progress()
-    preparing, words = Preparing(progress), {}
+    preparing = Preparing(progress)
     with stop_on_interrupt() as pressed:
         def stopped():
             preparing()
@@ -143,18 +143,17 @@ def _solve(request, plane, parts, watch):
 
         problems = []
         for number, (stokes, part) in enumerate(zip(grid.stokes, parts)):
-            report = partial(_report, progress, preparing, schedule_of(options).expected_iterations, watch.pace,
-                             (words, stokes))
+            report = partial(_report, progress, preparing, schedule_of(options).expected_iterations,
+                             None if number else watch.pace, (stokes, number, len(parts)))
             control = Control(report, stopped, tell=partial(_tell, stokes))
             start = None if plane.startmodel is None else plane.startmodel[number]
             samples = Samples(part.data, part.offsets, density, part.noise)
             problems.append(StokesProblem(stokes, samples, start, control))
         progress.prepare("computing the norms of the measurement operators, and the first images by non-negative least "
                          "squares (NNLS)")
-        cone = options.polbound and grid.stokes[0] == "I"
-        log.info(f"Stokes {', '.join(grid.stokes)} are solved side by side"
-                 + (", |(Q, U, V)| <= I in every pixel" if cone else ""))
-        found = reconstruct_polarised(problems, grid, options, plane.support, watch.checkpoint, cone)
+        if options.polbound and grid.stokes[0] == "I":
+            log.info(f"polbound = True: {', '.join(grid.stokes[1:])} are solved together, with |(Q, U, V)| <= I")
+        found = reconstruct_polarised(problems, grid, options, plane.support, watch.checkpoint)
     progress.close()
     for (stokes, one), part in zip(found.items(), parts):
         if one.record.stop_code == STOPPED_BY_USER and not pressed():
@@ -169,20 +168,17 @@ def _tell(stokes, line):
     log.info(f"Stokes {stokes}: {line}")
 
 
-def _report(progress, preparing, expected, pace, told, ppd, record):
-    """Show how far the solutions are, whenever that of the first Stokes parameter still going on has done a step."""
-    words, stokes = told
+def _report(progress, preparing, expected, pace, place, ppd, record):
+    """Show how far the solution of one Stokes parameter is; `place` is its name, its number, and how many there are."""
+    stokes, number, count = place
     preparing.over = True
     begun = record.resumed[-1] if record.resumed else 0
-    words[stokes] = (f"{stokes}: reduced chi-square "
-                     f"{reduced_chi2(record.residual_norm[-1], ppd.samples.sum()):.4g}, model flux "
-                     f"{record.model_flux[-1]:.5g} Jy, {record.reweighting[-1]} re-weightings")
-    if stokes != next(iter(words)):
-        return
-    if line := pace(ppd.iteration - begun):
+    if pace and (line := pace(ppd.iteration - begun)):
         log.info(line)
     fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-    progress(ppd.iteration, "; ".join(words.values()), fraction)
+    progress(ppd.iteration, f"Stokes {stokes}: reduced chi-square "
+             f"{reduced_chi2(record.residual_norm[-1], ppd.samples.sum()):.4g}, model flux {record.model_flux[-1]:.5g} "
+             f"Jy, {record.reweighting[-1]} re-weightings", (number + fraction) / count)
 
 
 def _images(request, plane, parts, found):

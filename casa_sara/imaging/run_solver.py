@@ -93,7 +93,7 @@ def density_of(data: Visibilities, selection: Selection | None, grid: ImageGrid,
         return np.ones(data.size, np.float32)
     log.info("computing the density of the uv coverage")
     if grid.mosaic is not None:
-        return mosaic_density(data.uvw, data.beam, data.imaging_weight, grid.mosaic)
+        return mosaic_density(data.uvw, data.beam, data.imaging_weight, grid.mosaic, comm)
     return sampling_density(data, selection, grid, comm)
 
 

@@ -12,7 +12,7 @@ from casa_sara.casa.images.spectral_index import reference_hz
 from casa_sara.casa.runtime import log
 from casa_sara.operators.subbands import Subbands
 
-__all__ = ["LARGEST_ERROR", "divided_by_band", "spectral_images", "spectral_index", "with_subbands"]
+__all__ = ["LARGEST_ERROR", "divided_by_band", "seen_draws", "spectral_images", "spectral_index", "with_subbands"]
 
 ARCSEC = np.radians(1 / 3600)
 FEWEST = 200  # samples of a block, whose noise level they give to 4 %
@@ -167,3 +167,16 @@ def spectral_index(seen, subbands, noise):
     error = spread**-0.5
     known = good & (error <= LARGEST_ERROR)
     return *(np.where(known, image, 0).astype(np.float32) for image in (index, error)), known
+
+
+def seen_draws(found, grid):
+    """Return the draws of bootstrap and jackknife of a reconstruction: of several frequencies, at the reference."""
+    drawn = found.draws, found.jackknife
+    if grid.subbands is None:
+        return drawn
+    weights = grid.subbands.reference_weights().astype(np.float32)
+
+    def at_reference(stacked):
+        return np.tensordot(weights, stacked.reshape(weights.size, -1, stacked.shape[-1]), 1)
+
+    return tuple(one and one.seen(at_reference) for one in drawn)

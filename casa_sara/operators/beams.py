@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from casa_sara.operators._workers import Workers
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.runtime import jit
 
-__all__ = ["Beam", "Mosaic", "beam_at", "mosaic_density"]
+__all__ = ["Beam", "Mosaic", "around", "beam_at", "mosaic_density"]
 
 LEAST = 0.1  # of the largest sensitivity, that of the mosaic where it ends
 COARSE = 128  # pixels along an image in which the overlap of beams is summed
@@ -111,6 +112,23 @@ class Mosaic:
     over: np.ndarray | None = None
     profiles: Any = None
 
+    def middle(self, number: int) -> tuple[float, float, float]:
+        """Return the direction cosines (l, m, n) of the middle of the part of the image that a beam takes.
+
+        Parameters
+        ----------
+        number : int
+            Of the beam.
+
+        Returns
+        -------
+        (float, float, float)
+        """
+        box = self.beams[number].box(self.shape, self.cell_rad)
+        l, m = ((axis.start + (axis.stop - axis.start) // 2 - n // 2) * step
+                for axis, n, step in zip(box, self.shape, (-self.cell_rad[0], self.cell_rad[1])))
+        return l, m, float(np.sqrt(1 - l**2 - m**2))
+
     def sums(self, beam_of_sample: np.ndarray, weight: np.ndarray) -> np.ndarray:
         """Return the summed weight of the samples of each beam, float64 (number of beams,).
 
@@ -125,7 +143,7 @@ class Mosaic:
         -------
         float64 (number of beams,)
         """
-        return np.bincount(beam_of_sample, weight, len(self.beams))
+        return np.bincount(beam_of_sample, weight, len(self.beams)).astype(float)  # of no samples they are whole
 
     def power(self, weights: npt.ArrayLike) -> np.ndarray:
         """Return Σ_g W_g A_g²: the weight of the data at each place of the sky.
@@ -182,7 +200,30 @@ class Mosaic:
         return replace(self, over=over)
 
 
-def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarray, mosaic: Mosaic) -> np.ndarray:
+def around(uvw: np.ndarray, middle: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """Return baselines around a place of the image, and the phase of that place: see `operators/mosaic.py`.
+
+    Parameters
+    ----------
+    uvw : float64 (3, M)
+        Wavelengths.
+    middle : (float, float, float)
+        Direction cosines (l0, m0, n0).
+
+    Returns
+    -------
+    uv : float64 (2, M)
+        (u − w l0/n0, v − w m0/n0).
+    turn : complex128 (M,)
+        exp(2πi [u l0 + v m0 + w (n0 − 1)]).
+    """
+    (u, v, w), (l, m, n) = uvw, middle
+    cycles = u * l + v * m + w * (n - 1)
+    return np.array([u - w * (l / n), v - w * (m / n)]), np.exp(2j * np.pi * (cycles - np.rint(cycles)))
+
+
+def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarray, mosaic: Mosaic,
+                   comm: Serial = SERIAL) -> np.ndarray:
     """Return the sampling density of each sample of a mosaic, float32 (M,), in the unit of `weight`.
 
     It is the sum of the weights in the sample's uv cell, those of each beam times its overlap with that of the sample,
@@ -202,13 +243,15 @@ def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarr
         Of each sample.
     mosaic : Mosaic
         The beams.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread.
 
     Returns
     -------
     float32 (M,)
     """
     count = len(mosaic.beams)
-    weights = mosaic.sums(beam_of_sample, weight)
+    weights = comm.allreduce(mosaic.sums(beam_of_sample, weight))
     step = max(1, max(mosaic.shape) // COARSE)
     x, y = np.arange(0, mosaic.shape[0], step)[:, None], np.arange(0, mosaic.shape[1], step)[None, :]
     gains = np.array([beam.at(x, y, mosaic.cell_rad).ravel().astype(np.float32) for beam in mosaic.beams])
@@ -221,16 +264,18 @@ def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarr
     cells = [np.rint(side * cell * axis).astype(np.int64) for side, cell, axis in zip(sides, mosaic.cell_rad, uvw)]
     other = (cells[0] < 0) | ((cells[0] == 0) & (cells[1] < 0))
     row, column = (np.where(other, -cell, cell) for cell in cells)
-    column -= column.min()
-    place = row * (column.max() + 1) + column
-    place = np.unique(place, return_inverse=True)[1].ravel()
+    column += comm.largest(-int(column.min(initial=0)))
+    place = row * (comm.largest(int(column.max(initial=0))) + 1) + column
+    here, place = np.unique(place, return_inverse=True)
+    everywhere = np.unique(np.concatenate(comm.allgather(here)))
+    place = np.searchsorted(everywhere, here)[place.ravel()]
     density = np.zeros(uvw.shape[1])
     order = np.argsort(beam_of_sample, kind="stable")
     ends = np.cumsum(np.bincount(beam_of_sample, minlength=count))
     members = [order[start:end] for start, end in zip([0, *ends[:-1]], ends)]
     for h, samples in enumerate(members):
-        if samples.size:
-            summed = np.bincount(place[samples], weight[samples], place.max() + 1)
+        if weights[h]:
+            summed = comm.allreduce(np.bincount(place[samples], weight[samples], everywhere.size).astype(float))
             for g in np.flatnonzero(overlap[h] > 0):
                 density[members[g]] += overlap[h, g] * summed[place[members[g]]]
     return np.maximum(density, weight).astype(np.float32)

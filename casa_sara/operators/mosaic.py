@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from casa_sara.operators._arguments import for_adjoint, for_forward
 from casa_sara.operators._workers import Workers
-from casa_sara.operators.beams import Mosaic, beam_at
+from casa_sara.operators.beams import Mosaic, around, beam_at
 from casa_sara.operators.measurement import MeasurementOperator, share_work_space
+from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.runtime import jit
 
 __all__ = ["MosaicOperator", "remaining_w_phase"]
@@ -45,10 +46,14 @@ class MosaicOperator:
         The beams.
     row_scale, eps, dtype, nthreads
         As of `MeasurementOperator`.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the visibilities are spread: the plans are those of all, which may be none here.
     """
 
-    def __init__(self, uvw: np.ndarray, beam_of_sample: np.ndarray, mosaic: Mosaic, row_scale: np.ndarray | None = None,
-                 eps: float = 1e-6, dtype: npt.DTypeLike = np.float32, nthreads: int = 1) -> None:
+    def __init__(self, uvw: np.ndarray, beam_of_sample: np.ndarray, mosaic: Mosaic,  # noqa: PLR0913 - five defaults
+                 row_scale: np.ndarray | None = None,
+                 eps: float = 1e-6, dtype: npt.DTypeLike = np.float32, nthreads: int = 1,
+                 comm: Serial = SERIAL) -> None:
         self.shape, self.size, self.dtype = tuple(mosaic.shape), uvw.shape[1], np.dtype(dtype)
         self.complex_dtype, self.workers = np.result_type(self.dtype, np.complex64), Workers(nthreads)
         if np.shape(beam_of_sample) != (self.size,):
@@ -56,9 +61,11 @@ class MosaicOperator:
         row_scale = np.broadcast_to(1.0, self.size) if row_scale is None else row_scale
         order = np.argsort(beam_of_sample, kind="stable")
         ends = np.cumsum(np.bincount(beam_of_sample, minlength=len(mosaic.beams)))
+        members = [order[start:end] for start, end in zip([0, *ends[:-1]], ends)]
+        whole = _whole(mosaic, uvw, members, comm)
         self._parts = [
-            _Part(mosaic, number, uvw, order[start:end], row_scale, eps, self.dtype, self.workers)
-            for number, (start, end) in enumerate(zip([0, *ends[:-1]], ends)) if end > start]
+            _Part(mosaic, number, uvw, samples, row_scale, eps, self.dtype, self.workers, whole[number])
+            for number, samples in enumerate(members) if samples.size]
         share_work_space([part.operator for part in self._parts])
         self._over = None if mosaic.over is None else mosaic.over.astype(self.dtype, copy=False)
         self._image = np.empty(self.shape if self._over is not None else (0, 0), self.dtype)
@@ -118,7 +125,7 @@ class MosaicOperator:
 class _Part:
     """The samples of one beam, `index` int32 (m,), and the transform of that part of the image."""
 
-    def __init__(self, mosaic, number, uvw, samples, row_scale, eps, dtype, workers):  # noqa: PLR0913 - one caller
+    def __init__(self, mosaic, number, uvw, samples, row_scale, eps, dtype, workers, whole):  # noqa: PLR0913 - one caller
         beam, cell = mosaic.beams[number], mosaic.cell_rad
         self.box = beam.box(mosaic.shape, cell)
         self.shape = tuple(axis.stop - axis.start for axis in self.box)
@@ -128,26 +135,30 @@ class _Part:
         self.corner = tuple(axis.start for axis in self.box)
         self.scales, self.profile = beam.scales(cell), beam.profile.astype(dtype, copy=False)
         self.index = samples.astype(np.int32)
-        u, v, w = uvw[:, samples]
-        l, m = ((axis.start + size // 2 - n // 2) * step
-                for axis, size, n, step in zip(self.box, self.shape, mosaic.shape, (-cell[0], cell[1])))
-        n = np.sqrt(1 - l**2 - m**2)
-        cycles = u * l + v * m + w * (n - 1)
-        self.rotation = np.exp(2j * np.pi * (cycles - np.rint(cycles))).astype(np.result_type(dtype, np.complex64))
-        uv = np.array([u - w * (l / n), v - w * (m / n)])
+        uv, rotation = around(uvw[:, samples], mosaic.middle(number))
+        self.rotation = rotation.astype(np.result_type(dtype, np.complex64))
         self.operator = MeasurementOperator(uv, cell, self.shape, np.asarray(row_scale)[samples], eps, dtype, workers,
-                                            (samples.size, _reach(uv, cell)))
+                                            (int(whole[0]), _reach(whole[1:] * cell) / cell))
 
     def space(self, pixels, vis):
         """Return as much as this part needs of the space that all share."""
         return pixels[: self.pixels].reshape(self.shape), vis[: self.index.size]
 
 
-def _reach(uv, cell):
-    """Largest |u| and |v| to plan for: those of the samples up to the next of few values, so that plans are alike."""
-    cycles = np.abs(uv).max(axis=1) * cell
+def _whole(mosaic, uvw, members, comm):
+    """Return how many visibilities each beam has, and their largest |u| and |v|, of all ranks; float64 (beams, 3)."""
+    here = np.zeros((len(members), 3))
+    for number, samples in enumerate(members):
+        uv, _ = around(uvw[:, samples], mosaic.middle(number))
+        here[number] = [samples.size, *np.abs(uv).max(axis=1, initial=0)]
+    everywhere = np.array(comm.allgather(here))
+    return np.column_stack([everywhere[:, :, 0].sum(axis=0), everywhere[:, :, 1:].max(axis=0)])
+
+
+def _reach(cycles):
+    """Largest |u| and |v| to plan for, in cycles per pixel: up to the next of few values, so that plans are alike."""
     steps = np.ceil(REACH_STEPS * np.log2(np.maximum(cycles, 1e-6)))
-    return np.maximum(np.minimum(2 ** (steps / REACH_STEPS), 0.5), cycles) / cell
+    return np.maximum(np.minimum(2 ** (steps / REACH_STEPS), 0.5), cycles)
 
 
 def remaining_w_phase(max_w: float, mosaic: Mosaic) -> float:

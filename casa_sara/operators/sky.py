@@ -64,7 +64,7 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
     def of_place(row_scale, eps):
         if grid.mosaic is not None:
             count = nthreads.count if isinstance(nthreads, Workers) else nthreads
-            return MosaicOperator(uvw, np.asarray(beam), grid.mosaic, row_scale, eps, dtype, count)
+            return MosaicOperator(uvw, np.asarray(beam), grid.mosaic, row_scale, eps, dtype, count, comm)
         return _of_place(uvw, grid, row_scale, eps, dtype, nthreads, comm)
 
     if grid.subbands is not None and freq_hz is not None:

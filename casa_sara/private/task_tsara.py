@@ -209,9 +209,9 @@ def _check_errors(parameters):
     """Raise where errors are asked for that cannot be found."""
     for name, right in (("ndraws", 0), ("jackknife", False)):
         value = parameters[name]
-        if value and parameters["specmode"] == "cube":
-            raise ValueError(f"{name} = {value} with specmode = 'cube': errors are found for continuum images only; "
-                             f"should be {right}")
+        if value and parameters["specmode"] == "cube" and parameters["restoringbeam"] in ("common", ["common"]):
+            raise ValueError(f"{name} = {value} with restoringbeam = 'common': the errors of a cube are smoothed to "
+                             "the beam of each channel; should be '', or the beam itself")
         if value and parameters["niter"] == 0:
             raise ValueError(f"{name} = {value} with niter = 0: errors are those of a model that was solved; should be "
                              f"{right}")
@@ -221,14 +221,9 @@ def _check_errors(parameters):
 
 def _refuse_for_mosaics(parameters):
     """Raise on parameters that mosaics do not have."""
-    if parameters["gridder"] != "mosaic":
-        return
-    for name, right, reason in (("specmode", "mfs", "mosaics are continuum images"),
-                                ("parallel", False, "a mosaic takes one process"),
-                                ("ndraws", 0, "errors by bootstrap are of single pointings only"),
-                                ("jackknife", False, "errors by jackknife are of single pointings only")):
-        if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} with gridder = 'mosaic': {reason}; should be {right!r}")
+    if parameters["gridder"] == "mosaic" and parameters["specmode"] == "cube" and parameters["report"]:
+        raise ValueError("report = True with gridder = 'mosaic' and specmode = 'cube': reports are made of mosaics of "
+                         "one channel, and of cubes of single pointings; should be False")
 
 
 def _check_single_dish(parameters):
@@ -265,11 +260,7 @@ def _refuse_for_spectra(parameters):
                                 ("stokes", "I", "spectra are those of the brightness"),
                                 ("positivity", True, "the brightness is positive at all frequencies"),
                                 ("spectralindex", "", "either the index is known, or it is solved for"),
-                                ("parallel", False, "spectra take one process"),
-                                ("report", False, "reports are made of one image"),
-                                ("savemodel", "none", "MODEL_DATA is written of one image"),
-                                ("ndraws", 0, "errors by bootstrap are of one image"),
-                                ("jackknife", False, "errors by jackknife are of one image")):
+                                ("parallel", False, "spectra take one process")):
         if parameters[name] != right:
             raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
 

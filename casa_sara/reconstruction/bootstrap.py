@@ -45,6 +45,7 @@ class Bootstrap:
     threshold : float
         κ of the solution.
     draws : Draws
+        Of the sky: of a mosaic the differences of x̂ are multiplied by 1/S.
     done : int
         Iterations of the present draw that are done.
     """
@@ -85,6 +86,9 @@ class Bootstrap:
             difference = self.ppd.scratch_image
             np.subtract(self.ppd.model, self.model, out=difference)
             difference *= difference.dtype.type(self.ppd.unit_jy * self._factor)
+            if self.ppd.sky_over_image is not None:
+                skies = self.ppd.planes.split(difference)
+                skies *= self.ppd.sky_over_image
             self.draws.add(difference)
             self.done = 0
             progress(self.draws)

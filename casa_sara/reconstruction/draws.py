@@ -72,6 +72,25 @@ class Draws:
             flat[pixels] = values.astype(np.float32) * np.float32(scale)
             yield image
 
+    def seen(self, look: Callable[[np.ndarray], np.ndarray]) -> Draws:
+        """Return the same draws of an image that is linear in these.
+
+        Parameters
+        ----------
+        look : callable
+            Takes an image of these draws, and returns another, (nx, ny).
+
+        Returns
+        -------
+        Draws
+        """
+        images = (look(difference) for difference in self.differences())
+        first = look(np.zeros(self.shape, np.float32))
+        found = Draws(first.shape, self.asked)
+        for image in images:
+            found.add(image)
+        return found
+
     def error(self, measure: Callable[[np.ndarray], np.ndarray] = lambda difference: difference) -> np.ndarray:
         """Return the error of something linear in the model: the root mean square of what it is of the differences.
 

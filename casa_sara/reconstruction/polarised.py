@@ -1,24 +1,23 @@
-"""Several Stokes parameters solved side by side: each its own solution, in steps that the cone ties together."""
+"""Several Stokes parameters: each its own solution, Q, U and V in steps that I ties together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
-from casa_sara.data.distribution import Layout
 from casa_sara.options import ImageGrid, SolverOptions
-from casa_sara.parallel.partition import ALONE
 from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.problem import Samples
 from casa_sara.reconstruction.reconstruct import Control, reconstruction_steps
 from casa_sara.reconstruction.result import Reconstruction
-from casa_sara.reconstruction.solution import Solution
-from casa_sara.solver.cone import PolarisationCone
+from casa_sara.solver.adaptive_ppd import AdaptivePPD
+from casa_sara.solver.polarisation import PolarisationBound
+from casa_sara.solver.record import UNFINISHED
 from casa_sara.solver.reweighting import Steps
 
 __all__ = ["StokesProblem", "options_of_stokes", "reconstruct_polarised"]
@@ -64,12 +63,13 @@ def options_of_stokes(options: SolverOptions, stokes: str) -> SolverOptions:
 
 
 def reconstruct_polarised(problems: list[StokesProblem], grid: ImageGrid, options: SolverOptions,
-                          support: np.ndarray | None = None, checkpoint: Checkpoint | None = None,
-                          cone: bool = True) -> dict[str, Reconstruction]:
-    """Find the images of several Stokes parameters, in one process.
+                          support: np.ndarray | None = None,
+                          checkpoint: Checkpoint | None = None) -> dict[str, Reconstruction]:
+    """Find the images of several Stokes parameters, in one process, one after the other.
 
-    Each has its own noise levels, weights of the prior, support and end. With the cone, |(Q, U, V)| ≤ I holds after
-    every step (:mod:`casa_sara.solver.cone`); without it, each is to the last bit what it is alone.
+    Each is to the last bit what it is alone, with noise levels, weights of the prior, support and end of its own. With
+    `options.polbound` that is so of I; then Q, U and V take their steps side by side, and |(Q, U, V)| ≤ I after each
+    (:mod:`casa_sara.solver.polarisation`), but for pixels where I may be negative, around unresolved sources.
 
     Parameters
     ----------
@@ -83,8 +83,6 @@ def reconstruct_polarised(problems: list[StokesProblem], grid: ImageGrid, option
         The models are exactly 0 elsewhere.
     checkpoint : Checkpoint, optional
         Keeps the states of all now and then; where it holds a `state` that was read, they go on from that.
-    cone : bool
-        |(Q, U, V)| ≤ I.
 
     Returns
     -------
@@ -95,78 +93,92 @@ def reconstruct_polarised(problems: list[StokesProblem], grid: ImageGrid, option
     ------
     CheckpointError
         The state that was read is not one of these data.
-    ValueError
-        There is a cone, and no I that is positive.
     """
-    if cone and not (problems[0].stokes == "I" and options.positivity):
-        raise ValueError(f"a cone of {', '.join(one.stokes for one in problems)} with positivity = "
-                         f"{options.positivity}: there should be a positive I, the first of them")
     states = _opened(checkpoint, problems, support)
     solving = [_Solving.of(one, partial(reconstruction_steps, grid=grid, options=options_of_stokes(options, one.stokes),
                                         support=support), checkpoint, states.get(one.stokes)) for one in problems]
-    asked = _advanced(solving)
-    together = PolarisationCone([one.solution.ppd for one in solving]) if cone else None
-    while asked:
-        _keep(checkpoint, solving)
-        if together is not None:
-            together.step(asked)
-        else:
-            for number in asked:
-                solving[number].solution.ppd.step()
-        asked = _advanced(solving)
+    bounded = options.polbound and problems[0].stokes == "I"
+    for together in [solving[:1], solving[1:]] if bounded else [[one] for one in solving]:
+        brightness = solving[0].brightness() if bounded and together[0] is not solving[0] else None
+        going, bound = _going(together), None
+        while going:
+            _keep(checkpoint, solving)
+            if brightness is None:
+                going[0].ppd.step()
+            else:
+                if bound is None or len(bound) > len(going):
+                    bound = PolarisationBound([one.ppd for one in going], _left_by(together, brightness))
+                bound.step([one.bounds for one in going])
+            going = _going(together)
     _keep(checkpoint, solving, any(one.ending for one in solving))
     return {one.stokes: one.found for one in solving if one.found is not None}
 
 
-def _advanced(solving):
-    """Go on to the next step of all; return the bounds of those that take one, by their numbers."""
-    bounds = [one.advance() for one in solving]
-    return {number: one for number, one in enumerate(bounds) if one is not None}
+def _going(solving):
+    """Go on to the next step of all, and return those that take one."""
+    return [one for one in solving if one.advance()]
+
+
+def _left_by(solving, brightness):
+    """Return what the solutions that have ended leave of |(Q, U, V)| ≤ I to the others, Jy/pixel."""
+    power = np.square(brightness, dtype=float)
+    for one in solving:
+        if one.found is not None:
+            power -= np.square(one.found.model, dtype=float)
+    return np.sqrt(np.maximum(power, 0)).astype(np.float32)
 
 
 @dataclass
 class _Solving:
-    """The solution of one Stokes parameter in progress; this is its checkpoint, too.
+    """The solution of one Stokes parameter; this is its checkpoint, too.
 
     `make_state` returns the state after the last whole iteration; `ending` is the state of a solution that was stopped,
-    and `found` the result of one that has ended.
+    `found` the result of one that has ended, and `signed` where its model may be negative.
     """
 
     stokes: str
-    layout: Layout
     file: Checkpoint | None = None
     state: dict[str, Any] | None = None
-    steps: Steps = field(init=False)
-    solution: Solution = field(init=False)
+    steps: Steps | None = None
+    ppd: AdaptivePPD | None = None
+    bounds: Any = None
     make_state: Callable[[], dict[str, Any]] | None = None
     ending: dict[str, Any] | None = None
     found: Reconstruction | None = None
+    signed: np.ndarray | None = None
+    iteration: int = 0
 
     @classmethod
     def of(cls, problem, steps_of, checkpoint, state):
-        """Make it ready to begin."""
-        solving = cls(problem.stokes, Layout(problem.samples.offsets, ALONE.comm), checkpoint, state)
-        control = replace(problem.control, checkpoint=solving, begun=solving.begin,
-                          then=lambda ppd, bounds, record: None)  # the iteration keeps its model
-        solving.steps = steps_of(problem.samples, startmodel=problem.startmodel, control=control)
+        """Make it ready to begin, or take over what has ended."""
+        solving = cls(problem.stokes, checkpoint, state)
+        if state is not None and "ended" in state:
+            with solving.applied():
+                solving.found, solving.signed = Reconstruction.of(state["ended"]), np.array(state["signed"])
+        control = replace(problem.control, checkpoint=solving, then=solving.end)
+        if solving.found is None:
+            solving.steps = steps_of(problem.samples, startmodel=problem.startmodel, control=control)
         return solving
 
-    def begin(self, solution):
-        """Take the solution, before its first iteration."""
-        self.solution = solution
-        if solution.result is not None:
-            self.make_state = partial(solution.state, None, self.layout, ALONE)
+    def end(self, ppd, bounds, record):
+        """Note, at the end, where the model may be negative; the iteration keeps its model for those beside it."""
+        self.signed = ppd.lowest < 0
+
+    def brightness(self):
+        """Return the model in Jy/pixel, +∞ where it may be negative."""
+        assert self.found is not None and self.signed is not None
+        return np.where(self.signed, np.float32(np.inf), self.found.model)
 
     def advance(self):
-        """Go on to the next step, and return the bounds that it is to be taken with; None once there is an end."""
-        if self.found is not None:
-            return None
+        """Go on to the next step of `ppd`, with `bounds`; return False once there is an end, and let go of all else."""
+        if self.steps is None:
+            return False
         try:
-            _, bounds = next(self.steps)
+            self.ppd, self.bounds = next(self.steps)
         except StopIteration as end:
-            self.found = end.value
-            return None
-        return bounds
+            self.found, self.steps, self.ppd, self.bounds, self.make_state = end.value, None, None, None, None
+            return False
+        return True
 
     def identify(self, **data):
         """Nothing to do: the data of all are known by their contents."""
@@ -184,15 +196,18 @@ class _Solving:
     def keep(self, make_state, iteration, now=False):
         """Take note of how the state is made; of a solution that is stopped, make it."""
         self.make_state = make_state
+        self.iteration = iteration
         if now:
             self.ending = make_state()
 
     def whole_state(self):
-        """Return the state between two iterations, None before the first, and for a solution that is not to be kept."""
+        """Return the state between two iterations, None of what has not begun, or was cut short before it did."""
         if self.ending is not None:
             return self.ending
-        if self.found is not None and self.make_state is not None:
-            return self.solution.state(None, self.layout, ALONE)
+        if self.found is not None:
+            if self.found.record.stop_code in UNFINISHED:
+                return None
+            return dict(ended=vars(self.found) | dict(record=self.found.record.state()), signed=self.signed)
         return self.make_state and self.make_state()
 
 
@@ -209,13 +224,14 @@ def _opened(checkpoint, problems, support):
         return {}
     with checkpoint.applied() as state:
         planes: Mapping[str, dict[str, Any]] = state["planes"]
-        return {one.stokes: planes[one.stokes] for one in problems}
+        return dict(planes)
 
 
 def _keep(checkpoint, solving, now=False):
-    """Write the states of all when it is time, or `now`; never those of a solution whose beginning was cut short."""
+    """Write the states of all that have one when it is time, or `now`."""
     if checkpoint is None or not checkpoint.due(now):
         return
-    states = {one.stokes: one.whole_state() for one in solving}
-    if all(states.values()):
-        checkpoint.keep(lambda: dict(planes=states), max(one.solution.ppd.iteration for one in solving), now=True)
+    states = {one.stokes: state for one in solving if (state := one.whole_state())}
+    if states:
+        done = max(one.iteration for one in solving if one.stokes in states)
+        checkpoint.keep(lambda: dict(planes=states), done, now=True)

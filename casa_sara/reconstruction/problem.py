@@ -27,6 +27,7 @@ from casa_sara.operators.widefield import WTerm
 from casa_sara.options import ImageGrid, SolverOptions
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.reconstruction.calibration import Calibration
+from casa_sara.reconstruction.mosaic_parts import parts_of
 from casa_sara.reconstruction.total_power import Beside, TotalPower, WhitenedDish
 from casa_sara.solver.interfaces import Measurement
 from casa_sara.solver.nnls import NNLSFit, nnls
@@ -178,14 +179,17 @@ class Problem:
         precond = of_samples = _preconditioner(samples, options.precondition, comm, grid.subbands)
         calibration = None if vis is None else Calibration(data, vis, offsets, measurement, comm)
         averaged = None
-        if options.averages and grid.mosaic is None:
+        if options.averages:
+            parts = grid.mosaic and parts_of(grid.mosaic, data.uvw, np.asarray(data.beam))
             averaged, uvw, freq_hz = _averages(partial(Averaged.of, data, offsets, averaging_cell(grid), vis=vis,
-                                                       operator=measurement, comm=comm), samples, finer, grid, options)
+                                                       operator=measurement, comm=comm, parts=parts), samples, finer,
+                                               grid, options)
         if averaged is not None:
             vis, offsets = averaged.whitened_mean(averaged.whitened), averaged.cells.offsets
             precond = averaged.weighted_mean(precond).astype(np.float32)
             root_weight = np.sqrt(averaged.sum_of_weights, dtype=np.float32, casting="same_kind")
-            measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy))
+            measurement = operator(uvw, freq_hz=freq_hz, row_scale=root_weight * np.float32(unit_jy),
+                                   beam=averaged.part_of_cell)
         dish = None
         if samples.total_power is not None:
             dish = samples.total_power.whitened(grid.shape, float(data.weight.sum(dtype=float)), unit_jy,
@@ -298,7 +302,8 @@ def _whitened_operator(data, operator, grid, options, unit_jy):
 def averaging_cell(grid: ImageGrid) -> np.ndarray:
     """Return the sides of the cells within which samples are averaged: :func:`casa_sara.data.averaging.cell_sides`.
 
-    An outlier is as far from the centre as the corner of an image that would hold it.
+    An outlier is as far from the centre as the corner of an image that would hold it. Of a mosaic the sides along u and
+    v are those of the widest beam.
 
     Parameters
     ----------
@@ -317,7 +322,11 @@ def averaging_cell(grid: ImageGrid) -> np.ndarray:
     if grid.outliers:  # an image of two pixels that reaches as far as all of them
         *reach, beyond = extents(grid)
         return cell_sides((2, 2), reach, max(depth, beyond), index)
-    return cell_sides(grid.shape, grid.cell_rad, depth, index)
+    shape = grid.shape
+    if grid.mosaic is not None:
+        boxes = [beam.box(grid.shape, grid.cell_rad) for beam in grid.mosaic.beams]
+        shape = tuple(max(box[axis].stop - box[axis].start for box in boxes) for axis in (0, 1))
+    return cell_sides(shape, grid.cell_rad, depth, index)
 
 
 def first_image(samples: Samples, problem_of: Callable[..., Problem], options: SolverOptions,

@@ -20,7 +20,7 @@ from casa_sara.reconstruction.paper_method import PAPER
 from casa_sara.reconstruction.problem import Problem, Samples, averaging_cell
 from casa_sara.reconstruction.result import Reconstruction
 from casa_sara.reconstruction.settings import check_l2bound, operator_accuracy, schedule_of
-from casa_sara.reconstruction.solution import Solution, begin, begin_draws, resume
+from casa_sara.reconstruction.solution import begin, begin_draws, resume
 from casa_sara.reconstruction.state_file import digest, digest_on_disk
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.dabbech2018 import run_paper_algorithm_2
@@ -56,8 +56,6 @@ class Control:
         each, and after every one.
     then : callable, optional
         Called at the end with the iteration, its bounds and its record, all as the solution has left them.
-    begun : callable
-        Called with the `Solution` before its first iteration, or once it has been resumed.
     """
 
     progress: Callable[[AdaptivePPD, SolverRecord], None] = lambda ppd, record: None
@@ -66,7 +64,6 @@ class Control:
     tell: Callable[[str], None] = lambda line: None
     drawn: Callable[[str, Draws], None] = lambda name, draws: None
     then: Callable[[AdaptivePPD, Any, SolverRecord], None] | None = None
-    begun: Callable[[Solution], None] = lambda solution: None
 
 
 def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, startmodel: np.ndarray | None = None,
@@ -100,8 +97,8 @@ def reconstruct(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     ------
     ValueError
         Noise levels that are neither one for all blocks nor one for each; too few blocks for a jackknife; errors
-        asked for of a mosaic, or with the paper's method; total power with errors, with bounds that do not adapt, or
-        on several ranks; outliers with errors, with the paper's method, or on several ranks.
+        asked for with the paper's method; total power with errors, with bounds that do not adapt, or on several ranks;
+        outliers with errors, with the paper's method, or on several ranks.
     CheckpointError
         The state that was read is not one of these data.
     """
@@ -141,7 +138,6 @@ def reconstruction_steps(samples: Samples, grid: ImageGrid, options: SolverOptio
         solution = begin(samples, problem_of, options, startmodel, control.stopped, ranks)
         if control.stopped():
             control = replace(control, checkpoint=None)
-    control.begun(solution)
     sides = averaging_cell(grid)
     averaging = _averaging(solution, sides)
     control.tell(_averaging_words(solution.ppd, averaging, options, grid, sides))
@@ -176,10 +172,9 @@ def _check(options, grid, samples, comm):
         _check_outliers(options, comm)
     if options.jackknife:
         jackknife_groups(blocks)
-    if (options.ndraws or options.jackknife) and (grid.mosaic is not None or options.method == PAPER):
-        what = "gridder = 'mosaic'" if grid.mosaic is not None else f"method = '{PAPER}'"
+    if (options.ndraws or options.jackknife) and options.method == PAPER:
         raise ValueError(f"ndraws = {options.ndraws}, jackknife = {options.jackknife}: should be 0 and False with "
-                         f"{what}, which has no errors of the model")
+                         f"method = '{PAPER}', which has no errors of the model")
 
 
 def _check_total_power(options, comm):
@@ -212,6 +207,7 @@ def _averaging(solution, sides):
 def _averaging_words(ppd, averaging, options, grid, sides):
     """Return the line of the log on it."""
     cell = f"uv cells of {sides[1]:.4g} x {sides[0]:.4g} wavelengths"
+    within = "block" if grid.mosaic is None else "block, pointing and kind of baseline"
     if averaging:
         smaller = 2 ** max(averaging["halvings"])
         finer = f", or up to {smaller} times smaller" if smaller > 1 else ""
@@ -219,12 +215,10 @@ def _averaging_words(ppd, averaging, options, grid, sides):
         cell = f"uv cells of {u:.4g} x {v:.4g} wavelengths"
         count = ppd.samples[:len(averaging["halvings"])].sum()
         return (f"{count} visibilities are averaged to {averaging['averages']} for the solver, within each "
-                f"block and {cell}{finer}; for the first image the averages are wrong by up to "
+                f"{within} and {cell}{finer}; for the first image the averages are wrong by up to "
                 f"{averaging['largest_error']:.2g} of their noise, which is corrected at every re-weighting")
     if not options.averages:
         return f"visibilities are not averaged: method = '{options.method}', databound = '{options.databound}'"
-    if grid.mosaic is not None:
-        return "visibilities are not averaged: gridder = 'mosaic'"
     return f"visibilities are not averaged: {cell} would leave more than half as many"
 
 
@@ -232,6 +226,10 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     """Tell the checkpoint, on rank 0, of what data the solution is: digests of all that it depends on."""
     data = samples.data
     gathered = dict(visibilities=data.vis, weights=data.weight, uvw=data.uvw, density=samples.density)
+    beams = None
+    if grid.mosaic is not None:
+        gathered["beam"] = np.asarray(data.beam)
+        beams = np.array([[*one.centre, one.radius_rad, *one.profile] for one in grid.mosaic.beams], np.float32)
     digests: dict[str, str | None] = {
         name: digest(whole) for name, array in gathered.items() if not data.scratch.on_disk
         and (whole := layout.gather(np.ascontiguousarray(array))) is not None}
@@ -241,7 +239,7 @@ def _identify(checkpoint, samples, layout, grid, support, comm):
     subbands = grid.subbands and grid.subbands.freqs_hz
     digests |= {name: None if array is None else digest(np.asarray(array)) for name, array in dict(
         blocks=layout.offsets, noise=samples.noise, support=support, spectralindex=spectralindex, subbands=subbands,
-        sensitivity=grid.mosaic and grid.mosaic.over,
+        beams=beams,
         sdimage=samples.total_power and samples.total_power.values).items()}
     comm.once(checkpoint.identify, **digests)
 
@@ -265,7 +263,10 @@ def _draw(solution, name, resampling, control, layout, ranks):
     drawn(draws)
     resampling.run(control.stopped, drawn, partial(_keep, solution, control.checkpoint, layout, ranks, None))
     if len(draws) >= FEWEST:
-        add_flux_errors(solution.result.record.islands, resampling.model, draws.flux_errors, ERRORS_OF_ISLANDS[name])
+        planes = solution.ppd.planes
+        seen = draws if planes.n_planes == 1 else draws.seen(planes.difference_at_reference)
+        add_flux_errors(solution.result.record.islands, planes.at_reference(resampling.model), seen.flux_errors,
+                        ERRORS_OF_ISLANDS[name])
     return draws.complete
 
 

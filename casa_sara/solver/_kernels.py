@@ -4,7 +4,6 @@ import numpy as np
 
 from casa_sara.runtime import jit
 
-LARGEST, TINY = 1e30, 1e-200  # the multiplier of what becomes 0
 _jit = jit.kernel(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 
 
@@ -81,7 +80,7 @@ def primal_step(model, anchor, model_bar, data_gradient, prior_gradient, steps, 
 def _polarised(models, units, metric, multiplier, i, k):
     """Return |p′|² and its derivative by λ, of p′ = p/(1 + λa), in Jy."""
     power = slope = 0.0
-    for s in range(1, len(models)):
+    for s in range(len(models)):
         shrink = 1.0 + multiplier * metric[s]
         value = units[s] * np.float64(models[s][i, k]) / shrink
         power += value * value
@@ -90,85 +89,33 @@ def _polarised(models, units, metric, multiplier, i, k):
 
 
 @_jit
-def _excess(models, units, metric, own, intensity, multiplier, i, k):
-    """Return |p′|(1 − λa_I) − I, which decreases with λ, its derivative, and |p′|."""
-    power, slope = _polarised(models, units, metric, multiplier, i, k)
-    size = np.sqrt(power)
-    rate = 0.5 * slope / max(size, TINY) * (1 - multiplier * own) - size * own
-    return size * (1 - multiplier * own) - intensity, rate, size
-
-
-@_jit
-def _bracket(models, units, metric, own, intensity, i, k):
-    """Return λ below and above the root of `_excess`; `LARGEST` for both where there is none."""
-    softest = pull = 0.0
-    for s in range(1, len(models)):
-        softest = max(softest, metric[s])
-        pull += (units[s] * np.float64(models[s][i, k]) / max(metric[s], TINY)) ** 2
-    if intensity <= 0 and own * np.sqrt(pull) <= -intensity:
-        return LARGEST, LARGEST
-    if intensity > 0 and own > 0:
-        return 0.0, 1.0 / own
-    low = 0.0 if intensity > 0 else 1.0 / own
-    high = max(2.0 * low, 1.0 / max(softest, TINY))
-    while high < LARGEST and _excess(models, units, metric, own, intensity, high, i, k)[0] > 0:
-        low, high = high, 4.0 * high
-    return (low, high) if high < LARGEST else (LARGEST, LARGEST)
-
-
-@_jit
-def _cone_multiplier(models, units, metric, own, intensity, i, k):
-    """Return the λ ≥ 0 at which |p′|(1 − λa_I) = I; `LARGEST` where there is none, and p′ = 0.
-
-    I is `intensity`, a_I is `own`. By Newton's method, between bounds.
-    """
-    low, high = _bracket(models, units, metric, own, intensity, i, k)
-    multiplier = low
-    for _ in range(60):
-        excess, rate, size = _excess(models, units, metric, own, intensity, multiplier, i, k)
-        if excess > 0:
-            low = multiplier
-        else:
-            high = multiplier
-        if abs(excess) <= 1e-9 * (size + abs(intensity)) or high - low <= 1e-12 * high:
+def _multiplier(models, units, metric, bound, i, k):
+    """Return the λ at which |p′| is the bound, by Newton's method for 1/|p′|, which is concave."""
+    multiplier = 0.0
+    for _ in range(40):
+        power, slope = _polarised(models, units, metric, multiplier, i, k)
+        size = np.sqrt(power)
+        if size <= bound * (1 + 1e-9):
             break
-        multiplier -= excess / min(rate, -TINY)
-        if not low < multiplier < high:
-            multiplier = 0.5 * (low + high)
+        multiplier += 2 * size * size * (size / bound - 1) / -slope
     return multiplier
 
 
 @_jit
-def _project_pixel(models, bars, anchors, units, metric, multiplier, moves, i, k):
-    """Replace p by p′ in one pixel, and I by |p′| where it `moves`."""
-    for s in range(1, len(models)):
-        if metric[s] > 0:
-            models[s][i, k] = 0 if multiplier == LARGEST else models[s][i, k] / (1.0 + multiplier * metric[s])
-            bars[s][i, k] = 2 * models[s][i, k] - anchors[s][i, k]
-    if moves:
-        models[0][i, k] = np.sqrt(_polarised(models, units, metric, 0.0, i, k)[0]) / units[0]
-        bars[0][i, k] = 2 * models[0][i, k] - anchors[0][i, k]
+def polarised_step(models, bars, anchors, bound, units, metric, worker, workers):
+    """Project x⁺ of some of Q, U and V on |(Q, U, V)| ≤ `bound` (Jy), in place, and x̄ = 2x⁺ − z with it.
 
-
-@_jit
-def cone_step(models, bars, anchors, free, lowest, units, metric, worker, workers):
-    """Project x⁺ of I and of some of Q, U and V on |(Q, U, V)| ≤ I, in place, and x̄ = 2x⁺ − z with it.
-
-    The first model is I, `units` are Jy of each; the projection is the nearest in Σ|x − x⁺|²/a of the images in Jy,
-    a the `metric`, which is 0 for what stays as it is. `free` is I before its own projection, `lowest` its least
-    values: where these are negative there is no cone, and where they are +∞ I is 0.
+    `units` are Jy of each; the projection is the nearest in Σ|x − x⁺|²/a of the images in Jy, a the `metric`.
     """
-    for i in range(free.shape[0] * worker // workers, free.shape[0] * (worker + 1) // workers):
-        for k in range(free.shape[1]):
-            intensity = units[0] * np.float64(models[0][i, k])
-            power = _polarised(models, units, metric, 0.0, i, k)[0]
-            if lowest[i, k] < 0 or power <= intensity * intensity:
+    for i in range(bound.shape[0] * worker // workers, bound.shape[0] * (worker + 1) // workers):
+        for k in range(bound.shape[1]):
+            most = np.float64(bound[i, k])
+            if _polarised(models, units, metric, 0.0, i, k)[0] <= most * most:
                 continue
-            moves = metric[0] > 0 and lowest[i, k] < np.inf
-            if moves:
-                intensity = units[0] * np.float64(free[i, k])
-            multiplier = _cone_multiplier(models, units, metric, metric[0] if moves else 0.0, intensity, i, k)
-            _project_pixel(models, bars, anchors, units, metric, multiplier, moves, i, k)
+            multiplier = _multiplier(models, units, metric, most, i, k) if most > 0 else np.inf
+            for s in range(len(models)):
+                models[s][i, k] /= 1.0 + multiplier * metric[s]
+                bars[s][i, k] = 2 * models[s][i, k] - anchors[s][i, k]
 
 
 @_jit

@@ -354,10 +354,15 @@ class AdaptivePPD:
             self.account_for([*of_parts[0].tolist(), float(self.planes.main(self.model).max())])
             self.rel_change = max(self.rel_change, whole)
         if self.planes.n_planes > 1 or self.sky_over_image is not None:
-            seen = self.planes.at_reference(self.model)
-            if self.sky_over_image is not None:
-                seen = np.multiply(seen, self.sky_over_image, out=self.planes.split(self.scratch_image)[0])
-            self.model_flux, self.model_max = float(seen.sum(dtype=float)), float(seen.max())
+            seen = self._seen() if self.comm.rank == 0 else np.zeros(1)  # the others wait before they change the model
+            self.model_flux, self.model_max = self.comm.bcast_numbers([float(seen.sum(dtype=float)), float(seen.max())])
+
+    def _seen(self):
+        """Return the sky at the reference frequency, real (nx, ny)."""
+        seen = self.planes.at_reference(self.model)
+        if self.sky_over_image is None:
+            return seen
+        return np.multiply(seen, self.sky_over_image, out=self.planes.split(self.scratch_image)[0])
 
     def account_for(self, sums: Sequence[float]) -> None:
         """Take σ, the flux and the largest pixel from sums over the model after a step.
@@ -369,25 +374,6 @@ class AdaptivePPD:
         """
         change, norm, self.model_flux, self.model_max = sums
         self.rel_change = float(np.sqrt(change / norm)) if norm > 0 else float(change > 0)
-
-    def unprojected(self, out: np.ndarray) -> np.ndarray:
-        """Return z − τ(ηΦ†v + ζΨu), what Step 17 has projected: of the last step, in one process.
-
-        Parameters
-        ----------
-        out : real (nx, ny)
-            Receives the result.
-
-        Returns
-        -------
-        real (nx, ny)
-        """
-        real = self.model.dtype.type
-        np.multiply(self._data_gradient, real(self.l2_step), out=out)
-        out += self._prior_gradient
-        out *= real(-self.tau)
-        out += self.anchor
-        return out
 
     def _summed_gradients(self, steps):
         """Return the two gradients and the steps to use with them: one sum over the ranks, in place of both.

@@ -179,10 +179,24 @@ class Planes:
         -------
         real (nx, ny)
         """
-        image = self._combined(self._reference, stacked)
+        image = self.difference_at_reference(stacked)
         if self._positivity and self.n_planes > 1:
             np.maximum(image, 0, out=image, where=self.split(stacked).min(axis=0) >= 0)
         return image
+
+    def difference_at_reference(self, stacked: np.ndarray) -> np.ndarray:
+        """Return what a change of all images is in the image that is looked at, whatever its sign.
+
+        Parameters
+        ----------
+        stacked : real (T·nx, ny)
+            Of z.
+
+        Returns
+        -------
+        real (nx, ny)
+        """
+        return self._combined(self._reference, stacked)
 
     def _combined(self, factors, stacked):
         if self.n_planes == 1:

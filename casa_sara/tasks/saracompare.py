@@ -25,6 +25,10 @@ class _saracompare:
     are the sky times the primary beam, with the same noise everywhere; fluxes in regions are of the
     sky. inject and features are for images of single pointings.
 
+    Of images with several Stokes parameters all this is of Stokes I. Where they have Q and U, polarised
+    intensity and angle are measured too, against the truth, if it has Q and U, or the first product
+    that has, and drawn. inject and features are for images of Stokes I alone.
+
     Cubes are compared channel by channel, and must have the same channels: models, residuals and
     fluxes in regions of each, the spectra, and the maps of the line: moment 0, the sum over the
     channels, and moment 1, the mean velocity. support, frames, inject and features are for images of

@@ -146,8 +146,8 @@ class _tsara:
         positivity=False. As in tclean, a sample with any correlation flagged is not used. Where the
         weight of one parallel-hand correlation is 0, negative or NaN, I alone is taken from the other
         one; of several Stokes parameters such a sample is not used.
-        Several are read once and solved side by side, each with its own noise levels and weights of the
-        prior; they are the planes of each product, as tclean writes them. Not available for several:
+        Several are read once, and solved each with its own noise levels and weights of the prior; they
+        are the planes of each product, as tclean writes them. Not available for several:
         specmode='cube', gridder='mosaic', method='dabbech2018', nterms, sdimage, ndraws, jackknife,
         savemodel, report and parallel.
         Examples: stokes='IQUV'
@@ -231,8 +231,8 @@ class _tsara:
         spectra are, as in tclean, those of the sky as seen by the antennas, whose primary beam
         becomes narrower with frequency: beyond the middle of the field .alpha is steeper than that
         of the sky. With gridder='mosaic', for one pointing too, they are those of the sky: the
-        primary beams of every frequency are in the model. Not with gridder='wproject',
-        spectralindex, report, savemodel, ndraws, jackknife, parallel.
+        primary beams of every frequency are in the model. Images of errors by ndraws and jackknife
+        are at reffreq. Not with gridder='wproject', spectralindex, parallel.
         Example: nterms=3
 
     nchan : int, default -1
@@ -308,8 +308,9 @@ class _tsara:
         same noise everywhere, as tclean's with normtype='flatnoise'; .image.pbcor and .model.pbcor are the
         sky, masked by pblimit. .weight is the weight of the data at each place of the sky, as tclean's, and
         .pb is the square root of it, 1 at its maximum. .psf is that of all data, without primary beams.
-        The model is zero where .pb is below 0.1. The visibilities of a mosaic are not averaged. Not available
-        with 'mosaic': specmode='cube', parallel=True, ndraws and jackknife.
+        The model is zero where .pb is below 0.1. .model.error is that of the sky, .image.error of the sky
+        times .pb. Of a cube .pb and .weight are those of each channel. Not available for cubes of 'mosaic':
+        report, and saracompare.
 
     onepointing : bool, default False
         Opened by gridder = 'standard' or 'wproject'.
@@ -471,8 +472,11 @@ class _tsara:
 
     polbound : bool, default False
         Only used where stokes has I and others. True allows no pixel of the models more polarised
-        intensity than total intensity, sqrt(Q^2 + U^2 + V^2) at most I; I, Q, U and V are then solved
-        for together.
+        intensity than total intensity, sqrt(Q^2 + U^2 + V^2) at most I: Q, U and V are solved for
+        together, after I, which stays what it is alone. Less noise is then taken for polarisation, above
+        all where I is nothing. It is wrong where the array does not see the brightness to which the
+        polarisation belongs, as that of a foreground or of a source larger than its shortest baseline
+        measures: what is polarised there is lost, and the log warns that the residual is not noise.
 
     precondition : bool, default True
         True scales the steps of the solver by the density of the uv coverage (preconditioning), so
@@ -572,7 +576,8 @@ class _tsara:
         beam lies within 1 error in 55 to 75 % of the pixels with S/N above 5, within 2 in 85 to 96 %.
         A draw takes 90 iterations, 20 draws 3 to 7 times as long as the run itself. Ctrl-C ends the
         draws with the errors that those made so far give; restart=True makes the others. For
-        continuum images with method='tsara'; 2 draws or more.
+        method='tsara'; 2 draws or more. Those of a cube are made channel by channel, and are not
+        kept; its restoringbeam cannot be 'common'.
 
     jackknife : bool, default False
         True divides the data blocks (see blocks) into up to 10 groups, and solves again without each
@@ -581,8 +586,8 @@ class _tsara:
         Jy/beam, and jackknife_error_jy of each island. With ndraws, the log compares both, and warns
         where they differ by more than a factor of 2. It also contains what the uv coverage of a
         group alone tells of the sky, and is then too large; where groups are few it is uncertain, by
-        a quarter with 10. Needs 4 blocks or more; for continuum images with method='tsara'. A group
-        takes as long as a draw of ndraws.
+        a quarter with 10. Needs 4 blocks or more (of a cube in each channel), and method='tsara'. A
+        group takes as long as a draw of ndraws.
 
     blocks : int or str or list of str, default 0
         0 makes one block of each MeasurementSet, observation and scan, and splits long scans in time,
@@ -676,7 +681,7 @@ class _tsara:
       visibilities were reduced for the solver, in uv cells of which size ('averaging', empty where
       they were not), how many points of sdimage were used and the noise found of them in Jy/beam
       ('total_power', where there is one), what was found in the images of outlierfile ('outliers', where
-      there are some), the history of re-weightings and iterations, the parameters that were
+      there are some), all of this for each of several Stokes parameters ('stokes'), the history of re-weightings and iterations, the parameters that were
       chosen automatically and why, how many samples were left out for which reason ('dropped'), and
       the iterations from which the run was resumed ('resumed').
 

@@ -17,12 +17,29 @@ from casa_sara.casa.ms.subtables import readable
 from casa_sara.casa.runtime.quantities import check_frequency
 from casa_sara.casa.runtime.tools import check_handles, made, more_handles, opened, scratch_folder
 
-__all__ = ["ImagePlane", "define_image_plane", "read_pixels", "read_planes", "slabs"]
+__all__ = ["ImagePlane", "define_image_plane", "read_pixels", "read_planes", "relative_pb", "slabs"]
 
 PB_LIMIT = 0.2  # of tclean
 _SELECTDATA_KEYS = {"timerange": "timestr", "uvrange": "uvdist", "observation": "obs", "intent": "state"}
 _LARGEST_OFFSET = 0.05  # pixels between where a pixel is and where its coordinates say
 _SLAB = 4_000_000  # pixels read or written at a time
+
+
+def relative_pb(weight: np.ndarray) -> np.ndarray:
+    """Return the primary beam of a mosaic, √(weight/largest weight) of every channel; 0 in those without data.
+
+    Parameters
+    ----------
+    weight : real (nx, ny) or (nchan, nx, ny)
+        Weight of the data at each place of the sky.
+
+    Returns
+    -------
+    real
+        Of the shape of `weight`.
+    """
+    largest = weight.max(axis=(-2, -1), keepdims=True)
+    return np.sqrt(np.divide(weight, largest, out=np.zeros_like(weight), where=largest > 0))
 
 
 @dataclass(frozen=True)
@@ -68,8 +85,8 @@ class ImagePlane:
 
         Parameters
         ----------
-        weight : real (nx, ny)
-            Weight of the data at each place of the sky.
+        weight : real (nx, ny), or (nchan, nx, ny) of a cube
+            Weight of the data at each place of the sky; 0 in channels without data.
         pblimit : float
             As of :func:`define_image_plane`.
 
@@ -77,7 +94,7 @@ class ImagePlane:
         -------
         ImagePlane
         """
-        pb = np.sqrt(weight / weight.max())
+        pb = relative_pb(weight)
         mask = pb > abs(pblimit)
         return replace(self, pb=np.where(mask, pb, np.float32(0)), mask=mask, sky_model=True)
 

@@ -13,9 +13,10 @@ from casa_sara.casa.images.fits_files import opened_image
 from casa_sara.casa.images.products import DRAWS, RECORD
 from casa_sara.casa.images.record import read_record
 from casa_sara.casa.images.sky_cube import SkyCube, read_sky_cube
-from casa_sara.casa.images.sky_image import SkyImage, read_header, read_sky_image
+from casa_sara.casa.images.sky_image import SkyImage, read_header, read_sky_image, stokes_of
 
-__all__ = ["ImageSet", "check_same_data", "data_names", "has_channels", "read_frames", "read_image_set"]
+__all__ = ["ImageSet", "check_same_data", "data_names", "has_channels", "read_frames", "read_image_set",
+           "read_polarised"]
 
 _SUFFIXES = ("", ".fits", ".fits.gz")
 _NAMES = (".model", ".model.fits", ".model.fits.gz", ".fits", ".fits.gz")
@@ -45,6 +46,8 @@ class ImageSet:
         Image of the model at several frequencies, '' where its spectra were not solved for.
     pb : str
         Image of the primary beam, '' where there is none.
+    polarised : dict of SkyImage
+        The models of 'Q' and 'U', where the image has both beside I.
     """
 
     name: str
@@ -56,6 +59,7 @@ class ImageSet:
     draws: str = ""
     spectra: str = ""
     pb: str = ""
+    polarised: dict[str, SkyImage] = field(default_factory=dict)
 
     def called(self, name):
         """Return the same with another name."""
@@ -76,7 +80,7 @@ def has_channels(given):
     """Tell whether a product is a cube; False where there is none, or no image, which reading it explains."""
     try:
         with opened_image(_model_path(given, "models")[0]) as ia:
-            return len(ia.shape()) > 2 and int(np.prod(ia.shape()[2:])) > 1
+            return len(ia.shape()) > 2 and int(np.prod(ia.shape()[2:])) > max(1, len(stokes_of(ia)))
     except (FileNotFoundError, RuntimeError):
         return False
 
@@ -116,9 +120,33 @@ def read_image_set(given, name="", with_residual=True, cube=False):
         parameters |= of_image
     record = root + RECORD
     return ImageSet(name or os.path.basename(root), model, residual, next(filter(None, beams), None),
-                    parameters | model.parameters, read_record(record) if os.path.isfile(record) else {},
+                    parameters | model.parameters, _of_stokes_i(read_record(record)) if os.path.isfile(record) else {},
                     root + DRAWS if os.path.isfile(root + DRAWS) else "", _beside(root, ".subbands"),
-                    _beside(root, ".pb"))
+                    _beside(root, ".pb"), {} if cube else read_polarised(path, "models"))
+
+
+def read_polarised(name, parameter):
+    """Return the images of Q and U, by name, of an image in Jy/pixel that has both; else {}.
+
+    Parameters
+    ----------
+    name : str
+        A CASA image, or a FITS file.
+    parameter : str
+        Task parameter that named it, for messages.
+
+    Returns
+    -------
+    dict of SkyImage
+    """
+    with opened_image(name) as ia:
+        there = {"Q", "U"} <= set(stokes_of(ia))
+    return {stokes: read_sky_image(name, parameter, ("Jy/pixel",), stokes=stokes) for stokes in "QU"} if there else {}
+
+
+def _of_stokes_i(record):
+    """Return a record with the entries of Stokes I at its top, as that of an image of Stokes I has them."""
+    return record | next((one for one in record.get("stokes") or [] if one.get("stokes") == "I"), {})
 
 
 def read_frames(names, plane):

@@ -19,6 +19,7 @@ from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, is_of_earth, rotation_betwe
 from casa_sara.casa.ms.subtables import readable, texts
 from casa_sara.casa.runtime.tools import opened
 from casa_sara.options import Selection
+from casa_sara.parallel.serial import SERIAL
 
 __all__ = ["PrimaryBeams", "Profiles", "primary_beams"]
 
@@ -83,7 +84,7 @@ class PrimaryBeams:
                 f"POINTING is not used; baselines of dishes of {dishes}; beams at {bands} GHz")
 
 
-def primary_beams(data, selection, grid, profiles=None):
+def primary_beams(data, selection, grid, profiles=None, comm=SERIAL):
     """Find the primary beam of every sample.
 
     Parameters
@@ -96,6 +97,8 @@ def primary_beams(data, selection, grid, profiles=None):
         Size, pixels and direction of the image.
     profiles : Profiles, optional
         That were found before, of other samples of the same data.
+    comm : casa_sara.parallel.serial.Serial or MPI
+        Over whose ranks the samples are spread: all but `beam_of_sample` is the same on all.
 
     Returns
     -------
@@ -106,21 +109,29 @@ def primary_beams(data, selection, grid, profiles=None):
     ValueError
         A field moves on the sky, or CASA has no beam of these dishes.
     """
-    centres, pointing_of_row = _pointings(data, grid)
-    dishes, dish_of_row = _dishes(data)
+    centres, pointing_of_row = _pointings(data, grid, comm)
+    dishes, dish_of_row = _dishes(data, comm)
     if profiles is None:
-        _check_fields(data)
-        profiles = Profiles(_bands(data.freq_hz, data.weight), [], np.zeros(0), np.zeros((0, PROFILE), np.float32))
+        comm.once(_check_fields, data)
+        bands = _bands(data.freq_hz, data.weight, comm)
+        profiles = Profiles(bands, [], np.zeros(0), np.zeros((0, PROFILE), np.float32))
     smaller, larger = np.sort(dish_of_row, axis=0)
     sizes = len(centres), len(dishes), len(dishes), len(profiles.bands_hz)
     of_row = np.ravel_multi_index((pointing_of_row, larger, smaller), sizes[:3])
     number = of_row[data.row] * sizes[3] + _nearest_band(data.freq_hz, profiles.bands_hz)
-    used, beam_of_sample = np.unique(number, return_inverse=True)
+    used, beam_of_sample = _common(number, comm)
     beams = np.array(np.unravel_index(used, sizes))
     wanted = [(dishes[k][0], dishes[k][1], dishes[n][1], int(number)) for _, k, n, number in beams.T.tolist()]
-    profiles = _with_kinds(profiles, sorted(set(wanted)), data, selection, grid)
+    profiles = comm.once(_with_kinds, profiles, sorted(set(wanted)), data, selection, grid)
     beams = np.stack([beams[0], [profiles.kinds.index(kind) for kind in wanted]], axis=1)
-    return PrimaryBeams(centres, profiles, beams, beam_of_sample.ravel().astype(np.int32))
+    return PrimaryBeams(centres, profiles, beams, beam_of_sample.astype(np.int32))
+
+
+def _common(values, comm):
+    """Return the distinct values (n,) of all ranks, sorted, and the place among them of each of this rank's."""
+    here, place = np.unique(values, return_inverse=True)
+    everywhere = np.unique(np.concatenate(comm.allgather(here)))
+    return everywhere, np.searchsorted(everywhere, here)[place.ravel()]
 
 
 def _nearest_band(freq_hz, bands_hz):
@@ -138,14 +149,14 @@ def _with_kinds(profiles, kinds, data, selection, grid):
                    values=np.concatenate([profiles.values, np.reshape(values, (-1, PROFILE)).astype(np.float32)]))
 
 
-def _pointings(data, grid):
+def _pointings(data, grid, comm):
     """Return the pixels (P, 2) of the distinct directions of fields, and the number of that of each row, int (R,)."""
     rows, centre = data.rows, data.phase_center
-    number = rows.ms.astype(np.int64) * (int(rows.field.max()) + 1) + rows.field
-    fields, first, of_row = np.unique(number, return_index=True, return_inverse=True)
+    most = 1 + max(field for _, field in data.fields)
+    fields, of_row = _common(rows.ms.astype(np.int64) * most + rows.field, comm)
     cosines = []
-    for row in first:
-        matrix = rotation_between(data.fields[int(rows.ms[row]), int(rows.field[row])], centre)
+    for number in fields.tolist():
+        matrix = rotation_between(data.fields[divmod(number, most)], centre)
         cosines.append(np.array([0.0, 0.0, 1.0]) if matrix is None else matrix[:, 2])
     cosines, distinct, found = np.array(cosines), [], np.empty(len(fields), int)
     for k, one in enumerate(cosines):
@@ -154,7 +165,7 @@ def _pointings(data, grid):
         found[k] = distinct.index(same[0]) if same else len(distinct) - 1
     l, m = cosines[distinct, 0], cosines[distinct, 1]
     pixels = np.stack([grid.shape[0] // 2 - l / grid.cell_rad[0], grid.shape[1] // 2 + m / grid.cell_rad[1]], axis=1)
-    return pixels, found[of_row.ravel()]
+    return pixels, found[of_row]
 
 
 def _check_fields(data):
@@ -168,21 +179,23 @@ def _check_fields(data):
                              "mosaics take fields in J2000 and the like; choose them with field")
 
 
-def _dishes(data):
+def _dishes(data, comm):
     """Return the kinds of dishes, (telescope, diameter in m), and those of the baseline of each row, int (2, R)."""
-    rows, kinds, of_row = data.rows, [], np.empty((2, data.rows.ms.size), int)
+    rows, ends, found = data.rows, np.zeros((2, data.rows.ms.size)), []
     for number in np.unique(rows.ms):
         name, here = data.ms_names[number], rows.ms == number
         with opened("table", os.path.join(name, "ANTENNA")) as tb:
             diameters = tb.getcol("DISH_DIAMETER")
         telescopes = set(texts(name, "OBSERVATION", "TELESCOPE_NAME"))
         telescope = "ALMA" if telescopes <= OF_ALMA else ", ".join(sorted(telescopes))
-        ends = diameters[np.stack([rows.antenna1[here], rows.antenna2[here]])]
-        for diameter in np.unique(ends).tolist():
-            if (telescope, diameter) not in kinds:
-                kinds.append((telescope, diameter))
-            of_row[:, here] = np.where(ends == diameter, kinds.index((telescope, diameter)), of_row[:, here])
+        ends[:, here] = diameters[np.stack([rows.antenna1[here], rows.antenna2[here]])]
+        found += [(int(number), diameter, telescope) for diameter in np.unique(ends[:, here]).tolist()]
+    found = sorted(set().union(*comm.allgather(found)))
+    kinds = list(dict.fromkeys((telescope, diameter) for _, diameter, telescope in found))
     _check_dishes(kinds)
+    of_row = np.zeros(ends.shape, int)
+    for number, diameter, telescope in found:
+        of_row[(rows.ms == number) & (ends == diameter)] = kinds.index((telescope, diameter))
     return kinds, of_row
 
 
@@ -199,17 +212,18 @@ def _check_dishes(kinds):
                          "only: image them separately, or with gridder = 'standard'")
 
 
-def _bands(freq_hz, weight):
+def _bands(freq_hz, weight, comm):
     """Return the mean frequencies of groups of similar ones, float64 (F,)."""
-    distinct, of_sample = np.unique(np.asarray(freq_hz, float), return_inverse=True)
+    distinct, of_sample = _common(np.asarray(freq_hz, float), comm)
     group, start = np.zeros(distinct.size, int), distinct[0]
     for k in range(1, distinct.size):
         new = distinct[k] > start * (1 + BAND)
         group[k] = group[k - 1] + new
         start = distinct[k] if new else start
-    of_sample = group[of_sample.ravel()]
-    sums = np.bincount(of_sample, weight)
-    return np.bincount(of_sample, weight * np.asarray(freq_hz, float)) / sums
+    of_sample, size = group[of_sample], group[-1] + 1
+    weighted = weight * np.asarray(freq_hz, float)
+    sums, moments = comm.allreduce(np.array([np.bincount(of_sample, one, size) for one in (weight, weighted)], float))
+    return moments / sums
 
 
 def _profile(data, selection, grid, telescope, diameters, freq_hz):

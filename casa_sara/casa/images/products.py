@@ -17,7 +17,7 @@ from dataclasses import asdict, replace
 import numpy as np
 
 from casa_sara.casa.images.image_files import write_image
-from casa_sara.casa.images.image_plane import ImagePlane
+from casa_sara.casa.images.image_plane import ImagePlane, relative_pb
 from casa_sara.casa.images.restore import restore, restored_beam, write_corrected
 from casa_sara.casa.runtime.child_process import ChildError, in_child
 from casa_sara.casa.runtime.tools import opened
@@ -155,7 +155,7 @@ def write_images(root, plane, images, sumwt, beam, output):
     write_image(root + ".residual", images["residual"], plane, masked=plane.masks_all)
     seen = images["model"]
     if plane.sky_model:  # restored is what is seen of it, of flat noise as .residual
-        seen = seen * np.sqrt(images["weight"] / images["weight"].max())
+        seen = seen * relative_pb(images["weight"])
         write_image(root + ".weight", images["weight"], plane)
     write_image(root + ".model", seen, plane, unit="Jy/pixel")
     write_image(root + ".pb", plane.pb, plane, masked=True)
@@ -182,7 +182,8 @@ def _write_errors(root, plane, images, beam, output):
     if "model.error" in images:
         write_image(root + ".model.error", images["model.error"], plane, unit="Jy/pixel")
     for name in {"image.error", "image.jackknife"} & images.keys():
-        restored = restored_beam(list(output.restoringbeam), beam)
+        words = list(output.restoringbeam)
+        restored = [restored_beam(words, one) for one in beam] if isinstance(beam, list) else restored_beam(words, beam)
         write_image(f"{root}.{name}", images[name], plane, unit="Jy/beam", beam=restored, masked=plane.masks_all)
 
 

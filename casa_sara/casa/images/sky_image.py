@@ -15,6 +15,7 @@ from casa_sara.casa.images.units import brightness_unit
 from casa_sara.casa.runtime.tools import safe_record
 
 __all__ = ["SkyImage", "SkyPlane", "beam_numbers", "check_finite", "check_sky_axes", "check_stokes_i", "parameters_of",
+           "stokes_of",
            "read_header", "read_sky_image", "unit_in", "unit_of"]
 
 _PARAMETER = re.compile(r"(\w+)\s*=\s*(.*)")
@@ -169,8 +170,8 @@ class SkyImage:
                                                         plane=plane)
 
 
-def read_sky_image(name, parameter, units, holes=False):
-    """Read one image plane.
+def read_sky_image(name, parameter, units, holes=False, stokes="I"):
+    """Read one image plane, of several Stokes parameters that of one.
 
     Parameters
     ----------
@@ -182,6 +183,8 @@ def read_sky_image(name, parameter, units, holes=False):
         What is right here: out of 'Jy/pixel', 'Jy/beam', ''; units that can be converted to these are. None takes any.
     holes : bool
         Pixels may be masked, or not finite, and are NaN then; else the mask is not looked at.
+    stokes : str
+        Which of the Stokes parameters, where there are several; of an image of one, I.
 
     Returns
     -------
@@ -199,13 +202,16 @@ def read_sky_image(name, parameter, units, holes=False):
             shape, given, beam = tuple(int(n) for n in ia.shape()), ia.brightnessunit(), ia.restoringbeam()
             csys, history = ia.coordsys(), ia.history(list=False)
             check_sky_axes(name, parameter, csys)
-            if int(np.prod(shape[2:])) != 1:
+            several = stokes_of(ia)
+            if int(np.prod(shape[2:])) != max(len(several), 1):
                 raise ValueError(f"{parameter} = '{name}' has the shape {list(shape)}: should be one Stokes, one "
                                  "channel")
-            check_stokes_i(name, parameter, csys)
-            pixels = read_pixels(ia)
+            if len(several) < 2 or stokes not in several:
+                check_stokes_i(name, parameter, csys)
+            number = several.index(stokes) if stokes in several else 0
+            pixels = read_pixels(ia, number=number)
             if holes:
-                pixels[~read_pixels(ia, getmask=True) | ~np.isfinite(pixels)] = np.nan
+                pixels[~read_pixels(ia, getmask=True, number=number) | ~np.isfinite(pixels)] = np.nan
     except (RuntimeError, UnicodeDecodeError) as error:
         raise ValueError(f"{parameter} = '{name}' cannot be read as an image: {str(error).strip()}") from error
     unit, factor = unit_in(units, name, parameter, given, csys)
@@ -268,6 +274,13 @@ def unit_of(text, csys):
         return unit, factor
     sky = csys.torecord()["direction0"]
     return "Jy/pixel", factor * float(abs(np.prod(sky["cdelt"]) * np.linalg.det(sky["pc"])))
+
+
+def stokes_of(ia):
+    """Return the Stokes parameters of an open image that has several, [] of others."""
+    csys = ia.coordsys()
+    stokes = list(csys.stokes()) if csys.findcoordinate("stokes")["return"] else []
+    return stokes if len(stokes) > 1 and len(stokes) in ia.shape()[2:] else []
 
 
 def check_stokes_i(name, parameter, csys):
