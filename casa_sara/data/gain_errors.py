@@ -161,8 +161,9 @@ class _Fit:
             rows = self._order[self._starts[start]:self._starts[stop]]
             rows = rows[first[rows] != second[rows]]
             index = ((self._interval[rows] - start) * n + first[rows]) * n + second[rows]
+            # of no rows at all bincount makes integers
             power, real, imag = self._comm.allreduce(
-                np.array([np.bincount(index, values[rows], (stop - start) * n * n) for values in self._sums]))
+                np.array([np.bincount(index, values[rows], (stop - start) * n * n) for values in self._sums], float))
             seen = power > 0
             chi_sq = float(((real[seen] ** 2 + imag[seen] ** 2) / power[seen]).sum())
             weights, products = (values.reshape(-1, n, n) for values in (power, real + 1j * imag))

@@ -676,8 +676,9 @@ class _tsara:
       mask of this channel is empty.
       The key 'sara' holds its own record: the islands of emission ('islands': place, flux with its
       error, S/N, size; with ndraws bootstrap_error_jy, the error that the draws give; with
-      jackknife jackknife_error_jy), the largest S/N of the residual by width ('residual_snr'), the
-      noise and bound of each block with its snapshot ('blocks'), to how many averages the
+      jackknife jackknife_error_jy), the largest S/N of the residual by width ('residual_snr'),
+      errors of the antenna gains that the residual shows ('gain_errors': rms of amplitude, relative,
+      and of phase, rad, the interval within which they stay, significance; empty without), the noise and bound of each block with its snapshot ('blocks'), to how many averages the
       visibilities were reduced for the solver, in uv cells of which size ('averaging', empty where
       they were not), how many points of sdimage were used and the noise found of them in Jy/beam
       ('total_power', where there is one), what was found in the images of outlierfile ('outliers', where
