@@ -10,7 +10,7 @@ field. Visibilities are type-3 non-uniform transforms, exact with w, of a sky on
 image. The field is imaged from the first (`alone`), and from the second with the outlier file and without it. SNR =
 20 log10(‖truth‖/‖truth − model‖) of the field smoothed to half and to one beam. tclean runs multiscale, with the same
 file and pblimit=-1, without which it does nothing outside the primary beam; of GRID, that with the best SNR at half a
-beam is shown.
+beam is shown. outlier.png shows the models.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT / "tests"), str(ROOT)]
 
@@ -222,6 +223,26 @@ def compare(folder, case):
         half, one, flux = scored(sky, models[0], case, beam)
         far = "{:.4f} | {:.3f}".format(*of_double(models[1])) if len(models) > 1 else "– | –"
         print(f"| {label} | {half:.1f} | {one:.1f} | {flux:.3f} | {far} | {seconds:.0f} |")
+    draw(folder, case, sky, beam, [(rows[k][0], rows[k][1][0]) for k in (1, 4, 2)])
+
+
+def draw(folder, case, sky, beam, models):
+    """Draw the field, smoothed to half a beam, on one logarithmic scale: outlier.png."""
+    import matplotlib.pyplot as plt
+    from scenes import smoothed_truth
+
+    from casa_sara.analysis.metrics import smooth
+
+    fwhm = [0.5 * axis / case.cell for axis in beam[:2]]
+    panels = [("true sky", smoothed_truth(sky, fwhm, beam[2]))]
+    panels += [(label, smooth(model, fwhm, beam[2])) for label, model in models]
+    top = panels[0][1].max()
+    figure, axes_of_panels = plt.subplots(1, len(panels), figsize=(16, 4.3), layout="constrained")
+    for axis, (label, image) in zip(axes_of_panels, panels):
+        axis.imshow(np.log10(np.maximum(image / top, 1e-4)).T, origin="lower", vmin=-3.5, vmax=0, cmap="inferno")
+        axis.set(title=label, xticks=[], yticks=[])
+    figure.savefig(folder / "outlier.png", dpi=70)
+    plt.close(figure)
 
 
 def lost(folder, case, seeds):

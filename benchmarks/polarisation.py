@@ -37,8 +37,8 @@ SUPER_RESOLUTION = 1.7
 STOKES = "IQUV"
 MOST_POLARISED, TURNS, CIRCULAR = 0.6, 2.0, 0.01
 SHORT_SCALES, LONG_SCALES = (0, 0.6, 1.8, 5.4), (0, 0.6, 1.8, 5.4, 16)
-GRID = {"short": (SHORT_SCALES, 20_000, 2.0), "long": (LONG_SCALES, 20_000, 2.0),
-        "deep": (LONG_SCALES, 20_000, 1.0)}  # scales in units of the beam, most iterations, nsigma
+# scales in units of the beam, most iterations, nsigma; 40 major cycles at most
+GRID = {"short": (SHORT_SCALES, 20_000, 3.0), "long": (LONG_SCALES, 20_000, 3.0), "deep": (LONG_SCALES, 20_000, 1.5)}
 CIRCULAR_FEEDS, LINEAR_FEEDS = "RR RL LR LL", "XX XY YX YY"
 
 
@@ -227,7 +227,7 @@ def run_clean(name, folder):
             from casatasks import tclean
 
             tclean(**common, imagename=str(root), deconvolver="multiscale",
-                   scales=sorted({round(scale * width) for scale in scales}), niter=niter, gain=0.2, nsigma=nsigma,
+                   scales=sorted({round(scale * width) for scale in scales}), niter=niter, nsigma=nsigma, nmajor=40,
                    restoringbeam=[f"{beam[0]}arcsec", f"{beam[1]}arcsec", f"{beam[2]}deg"])
         seconds = time.perf_counter() - begin
         of_model = measures.of(measures.seen(planes(f"{root}.model")[0]))

@@ -19,9 +19,10 @@ from casa_sara.imaging.outliers import with_turns
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.outliers import ImagesDictionary, extents, rotation, stacked
 from casa_sara.operators.sky import sky_operator
-from casa_sara.options import ImageGrid, Outlier, Selection, images_in
+from casa_sara.options import ImageGrid, Outlier, Selection, SolverOptions, images_in
 from casa_sara.private.outlier_file import read_outlier_file
-from casa_sara.reconstruction.problem import averaging_cell
+from casa_sara.reconstruction.problem import Samples, averaging_cell
+from casa_sara.reconstruction.reconstruct import Control, reconstruct
 from casa_sara.reconstruction.state_file import CheckpointError
 from casa_sara.solver.adaptive_ppd import AdaptivePPD
 from casa_sara.solver.planes import Images
@@ -176,6 +177,25 @@ def test_a_bright_outlier_does_not_hide_that_the_main_image_changes():
         assert ppd.rel_change == pytest.approx(max(changes[-1]), rel=1e-3)
         assert (ppd.model_flux, ppd.model_max) == pytest.approx((main.sum(), main.max()), rel=1e-4)
     assert all(of_main > of_all for of_all, of_main in changes)
+
+
+def test_kappa_follows_from_the_main_image():
+    """However bright the outlier is."""
+    data = observation([(0, 0, 0, 0, 40)])
+    data.uvw[:], rng = baselines(400), np.random.default_rng(9)
+    grid = grid_of("standard")
+    images, thresholds = [np.zeros(shape, np.float32) for shape in SHAPES], []
+    images[0][10, 9] = 1
+    noise = 0.1 * (rng.standard_normal(400) + 1j * rng.standard_normal(400))
+    data.weight[:] = 0.1**-2
+    control = Control(lambda ppd, record: thresholds.append(ppd.threshold * ppd.unit_jy))
+    for flux in (1, 1000):
+        images[1][8, 6] = flux
+        data.vis[:] = sky_operator(data.uvw, grid).forward(stacked(images)) + noise
+        reconstruct(Samples(data, np.array([0, 400]), np.ones(400), np.ones(1)), grid,
+                    SolverOptions(niter=1, wavelevels=1), control=control,
+                    support=stacked([np.ones(shape, bool) for shape in SHAPES]))
+    assert 0.05 < thresholds[0] < 0.2 and thresholds[1] == pytest.approx(thresholds[0], rel=0.3)
 
 
 def test_averages_are_made_for_the_farthest_corner():

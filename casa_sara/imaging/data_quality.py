@@ -10,7 +10,7 @@ from casa_sara.operators.measurement import check_cell, check_field
 from casa_sara.parallel.serial import SERIAL
 
 __all__ = ["beyond_baselines", "check_confined", "image_limits", "left_outside", "named_suspects", "nowhere_visible",
-           "suspects", "thermal_noise"]
+           "suspects", "thermal_noise", "without_w_term"]
 
 PEAK_OUTSIDE = 6.0  # standard deviations of the thermal noise
 ABOVE_INSIDE = 1.5  # times the largest residual inside: calibration errors leave as much on either side
@@ -204,12 +204,16 @@ def image_limits(data, grid, comm=SERIAL):
                      f"'{arcsec * pixels / 5:.3g}arcsec'")
     if grid.is_mosaic:
         return notes + w_note(max_w, grid.mosaic, LARGEST_W_PHASE)
-    corner_sq = 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
-    phase = np.pi * max_w * corner_sq
-    if phase > LARGEST_W_PHASE and grid.gridder == "standard":
-        notes.append(f"the w-term is not modelled: it changes phases by up to {phase:.2g} rad in the corners of this "
-                     "image; gridder = 'wproject' models it")
-    return notes
+    return notes + without_w_term(max_w, grid)
+
+
+def without_w_term(max_w, grid, image="this image"):
+    """Return the warning about a w-term that is not modelled where it matters, for a largest |w| in wavelengths."""
+    phase = np.pi * max_w * 0.25 * sum((n * cell) ** 2 for n, cell in zip(grid.shape, grid.cell_rad))
+    if phase <= LARGEST_W_PHASE or grid.gridder != "standard":
+        return []
+    return [f"the w-term is not modelled: it changes phases by up to {phase:.2g} rad in the corners of {image}; "
+            "gridder = 'wproject' models it"]
 
 
 def nowhere_visible(grid, output):

@@ -16,7 +16,7 @@ from casa_sara.casa.images.restore import fit_beam
 from casa_sara.casa.ms.frames import direction_on_sky, rotation_between
 from casa_sara.casa.ms.weights import dirty_image
 from casa_sara.casa.runtime import log
-from casa_sara.imaging.data_quality import check_confined
+from casa_sara.imaging.data_quality import check_confined, without_w_term
 from casa_sara.imaging.plane_images import IMAGE_EPS, PlaneImages
 from casa_sara.operators.measurement import check_cell, check_field
 from casa_sara.operators.outliers import directions, rotation, stacked
@@ -111,12 +111,11 @@ def _check_apart(grid):
 
 
 def _check_pixels(outlier, data):
-    """Raise where the pixels of an outlier are too large for the data, or its image too small."""
-    longest = np.zeros(2)
-    for _, part in data.parts():
-        np.maximum(longest, np.abs(outlier.turn[:2] @ part.uvw).max(axis=1, initial=0), out=longest)
+    """Raise where the pixels of an outlier are too large for the data, or its image too small; note a w-term."""
+    reach = np.abs(outlier.turn @ data.uvw).max(axis=1, initial=0)
+    data.notes.extend(without_w_term(reach[2], outlier.grid, f"the image '{outlier.imagename}'"))
     try:
-        check_cell(longest[:, None], outlier.grid.cell_rad)
+        check_cell(reach[:2, None], outlier.grid.cell_rad)
         check_field(data.max_uv, outlier.grid.shape, outlier.grid.cell_rad)
     except ValueError as error:
         raise ValueError(f"outlierfile, imagename = '{outlier.imagename}': {error}") from error

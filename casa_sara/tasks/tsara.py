@@ -681,7 +681,7 @@ class _tsara:
       visibilities were reduced for the solver, in uv cells of which size ('averaging', empty where
       they were not), how many points of sdimage were used and the noise found of them in Jy/beam
       ('total_power', where there is one), what was found in the images of outlierfile ('outliers', where
-      there are some), the history of re-weightings and iterations, the parameters that were
+      there are some), all of this for each of several Stokes parameters ('stokes'), the history of re-weightings and iterations, the parameters that were
       chosen automatically and why, how many samples were left out for which reason ('dropped'), and
       the iterations from which the run was resumed ('resumed').
 
