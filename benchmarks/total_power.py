@@ -124,7 +124,8 @@ def realisations(folder, dish=DISHES[1], noise=NOISE[1], seeds=(3, *range(20, 29
     along = (np.arange(SIZE) - SIZE // 2) * CELL
     near, width = np.hypot(along[:, None], along[None, :]) < RADIUS, np.hypot(dish, FWHM)
     for seed in seeds:
-        sd = observe_with_dish(folder / f"dish_{seed}.im", truth, CELL, CENTRE, dish, FREQ, noise, width=500.0, seed=seed)
+        sd = observe_with_dish(folder / f"dish_{seed}.im", truth, CELL, CENTRE, dish, FREQ, noise, width=500.0,
+                               seed=seed)
         ia = casatools.image()
         ia.open(sd)
         pixels, step = ia.getchunk()[:, :, 0, 0], np.degrees(abs(ia.coordsys().increment()["numeric"][0])) * 3600
