@@ -1,6 +1,7 @@
 """Total power: tsara with and without a single-dish image, beside feather and sdintimaging.
 
     python benchmarks/total_power.py FOLDER                 # a Gaussian of 1 Jy and 30 arcsec
+    python benchmarks/total_power.py FOLDER --noise         # its flux in ten realisations of the noise of the dish
     python benchmarks/total_power.py FOLDER --scene M31     # the mosaic of benchmarks/mosaic.py, 12 m, 7 m, and a dish
 
 The Gaussian is seen by the VLA in C configuration at 8.4 GHz on baselines above 6.5 klambda, where it has 5 % of its
@@ -108,6 +109,33 @@ def gaussian(folder):
     for label, flux, width, one, ten in rows:
         print(f"| {label} | {flux:.3f} | {width:.1f} | {one:.1f} | {ten:.1f} |", flush=True)
     picture(folder, truth, beam, cleans[-1][2])
+
+
+def realisations(folder, dish=DISHES[1], noise=NOISE[1], seeds=(3, *range(20, 29))):
+    """Print the flux of the Gaussian, beside that of the map of the dish alone for a source of known place and shape.
+
+    The latter weights all pixels of the map alike: it is as good as the dish can know the flux.
+    """
+    import casatools
+
+    from casa_sara.demo.single_dish import observe_with_dish
+
+    name, truth, found = observe(folder), the_sky(), []
+    along = (np.arange(SIZE) - SIZE // 2) * CELL
+    near, width = np.hypot(along[:, None], along[None, :]) < RADIUS, np.hypot(dish, FWHM)
+    for seed in seeds:
+        sd = observe_with_dish(folder / f"dish_{seed}.im", truth, CELL, CENTRE, dish, FREQ, noise, width=500.0,
+                               seed=seed)
+        ia = casatools.image()
+        ia.open(sd)
+        pixels, step = ia.getchunk()[:, :, 0, 0], np.degrees(abs(ia.coordsys().increment()["numeric"][0])) * 3600
+        ia.close()
+        x = (np.arange(pixels.shape[0]) - pixels.shape[0] // 2) * step
+        shape = (dish / width) ** 2 * np.exp(-4 * np.log(2) * (x[:, None] ** 2 + x[None, :] ** 2) / width**2)
+        found.append(((pixels * shape).sum() / (shape**2).sum(), ours(folder, name, sd)[near].sum()))
+        print("seed {}: known shape {:.3f} Jy, tsara {:.3f} Jy".format(seed, *found[-1]), flush=True)
+    for label, fluxes in zip(("known shape", "tsara"), np.transpose(found)):
+        print(f"{label}: mean {fluxes.mean():.3f}, standard deviation {fluxes.std(ddof=1):.3f} Jy")
 
 
 def picture(folder, truth, beam, clean):
@@ -263,10 +291,13 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scene")
+    parser.add_argument("--noise", action="store_true")
     args = parser.parse_args()
     args.folder.mkdir(parents=True, exist_ok=True)
     if args.scene:
         mosaic(args.folder.resolve(), args.scene)
+    elif args.noise:
+        realisations(args.folder.resolve())
     else:
         gaussian(args.folder.resolve())
 

@@ -175,22 +175,22 @@ def test_a_run_stopped_on_two_ranks_goes_on_on_three_to_the_same_image(two, thre
 
 @mpi
 @pytest.mark.slow
-def test_a_mosaic_on_two_and_three_ranks(folder):
+def test_a_mosaic_on_two_and_three_ranks(tmp_path):
     """As of one process: beams, weights, averages, images and errors; stopped on two ranks, it goes on on three."""
     sky = [(1.0, 0.0, 0.0), (0.5, 20 * ARCSEC, 10 * ARCSEC)]
-    vis = simulate_mosaic(folder / "mosaic.ms", [(0, 0), (25, 0), (0, 25)], sky, dishes=(12.0,) * 5 + (7.0,) * 3,
+    vis = simulate_mosaic(tmp_path / "mosaic.ms", [(0, 0), (25, 0), (0, 25)], sky, dishes=(12.0,) * 5 + (7.0,) * 3,
                           noise=0.1, rounds=2, hours=2.0, spws=(("100GHz", "20MHz", 6), ("104GHz", "20MHz", 2)))
     common = dict(vis=vis, imsize=[120, 108], cell="1.2arcsec", gridder="mosaic", datacolumn="data", niter=40,
                   phasecenter=f"J2000 {CENTRE[0]}deg {CENTRE[1]}deg", wavelets=["dirac", "db2"], weighting="briggs",
                   ndraws=2, nthreads=1, blocks=3)
-    names = {name: str(folder / f"mosaic_{name}") for name in ("alone", "two", "stopped")}
+    names = {name: str(tmp_path / f"mosaic_{name}") for name in ("alone", "two", "stopped")}
     expected = mpi_steps.run(imagename=names["alone"], **common)
     shared = dict(common, parallel=True)
     done, said = _mpirun(2, [["run", dict(shared, imagename=names["two"])],
-                             ["stopped", dict(shared, imagename=names["stopped"])]], folder)
+                             ["stopped", dict(shared, imagename=names["stopped"])]], tmp_path)
     assert done.returncode == 0, done.stderr
     _same_findings(said[0], expected, 2)
-    done, resumed = _mpirun(3, [["run", dict(shared, imagename=names["stopped"], restart=True)]], folder)
+    done, resumed = _mpirun(3, [["run", dict(shared, imagename=names["stopped"], restart=True)]], tmp_path)
     assert done.returncode == 0, done.stderr
     assert resumed[0][0]["resumed"] == [mpi_steps.WHEN] and 0 < expected["averages"] < expected["visibilities"] / 2
     _same_findings(resumed[0], expected | dict(resumed=[mpi_steps.WHEN]), 3)
