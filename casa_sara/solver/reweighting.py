@@ -21,7 +21,7 @@ from casa_sara.solver.record import (
     UNFEASIBLE,
     SolverRecord,
 )
-from casa_sara.solver.residual_structure import look_at
+from casa_sara.solver.residual_structure import STRUCTURE, look_at, structure_of
 from casa_sara.solver.significance import SignificantSupport
 
 __all__ = ["Schedule", "Stage", "Steps", "algorithm_2", "run_algorithm_2", "stepped"]
@@ -38,6 +38,7 @@ NEARLY = 2.0  # bounds may be off by so many of their tolerances where the model
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 USUAL = 9  # re-weightings that most data need
 OF_COSTLY = (0, 1, 2, 4, 8, 16)  # re-weightings at which averages of visibilities on the disk are made anew
+FALLING = 0.97  # of the residual's structure an interval before: what falls so much is not left by the data
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
 
@@ -103,6 +104,10 @@ class Stage:
         Iteration after which the present problem began.
     settled : int
         For how many iterations the model has changed by less than the tolerance.
+    structure : float
+        Largest S/N of the residual over a beam or more, when the last problem had converged.
+    until : int
+        Iteration to which the last problem goes on, because that becomes less.
     release : Release
     support : SignificantSupport or None
     record : SolverRecord
@@ -112,6 +117,8 @@ class Stage:
     last: bool = False
     start: int = 0
     settled: int = 0
+    structure: float = float("inf")
+    until: int = 0
     release: Release = field(default_factory=Release)
     support: SignificantSupport | None = None
     record: SolverRecord = field(default_factory=SolverRecord)
@@ -230,7 +237,11 @@ def algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, schedule
         if stage.k >= schedule.nreweights and not stage.last:
             _begin_last(ppd, bounds, stage)
         record.stop_code = yield from _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep)
-        if stage.last or record.stop_code != CONVERGED:
+        if record.stop_code != CONVERGED:
+            break
+        if stage.last:
+            if schedule.confined and _structure_falls(ppd, bounds, schedule, stage):
+                continue
             break
         if _renew_weights(ppd, bounds, schedule, stage):
             stage.start, stage.settled = ppd.iteration, 0
@@ -259,6 +270,19 @@ def _begin_last(ppd, bounds, stage):
         ppd.renew_averages(ppd.model)
     bounds.finish(ppd)
     stage.last, stage.start, stage.settled = True, ppd.iteration, 0
+
+
+def _structure_falls(ppd, bounds, schedule, stage):
+    """Whether the residual still holds structure that becomes less: then the last problem goes on for an interval."""
+    if ppd.iteration - stage.start >= LONGEST * schedule.interval:
+        return False
+    before, stage.structure = stage.structure, structure_of(ppd, bounds)
+    if not STRUCTURE < stage.structure < FALLING * before:
+        return False
+    if ppd.averaged is not None and not ppd.averaged.costly:
+        ppd.renew_averages(ppd.model)
+    stage.until, stage.settled = ppd.iteration + schedule.interval, 0
+    return True
 
 
 def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
@@ -290,6 +314,8 @@ def _stop_code(ppd, bounds, schedule, stage):
         _damp(ppd, norms[-schedule.interval:])
     if not stage.last and done >= (FIRST_INTERVALS if stage.k == 0 else 1) * schedule.interval:
         return CONVERGED
+    if ppd.iteration < stage.until:
+        return None
     # the model has settled; the residual and the bounds may need longer, but not for ever
     tolerance = schedule.final_reltol if stage.last else schedule.reltol
     stage.settled = stage.settled + 1 if ppd.rel_change < tolerance else 0
