@@ -237,16 +237,8 @@ def algorithm_2(ppd: AdaptivePPD, bounds: GivenBounds | AdaptiveBounds, schedule
         if stage.k >= schedule.nreweights and not stage.last:
             _begin_last(ppd, bounds, stage)
         record.stop_code = yield from _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep)
-        if record.stop_code != CONVERGED:
+        if record.stop_code != CONVERGED or not _begin_next(ppd, bounds, schedule, stage):
             break
-        if stage.last:
-            if schedule.confined and _structure_falls(ppd, bounds, schedule, stage):
-                continue
-            break
-        if _renew_weights(ppd, bounds, schedule, stage):
-            stage.start, stage.settled = ppd.iteration, 0
-        else:
-            _begin_last(ppd, bounds, stage)
     if record.stop_code == DIVERGED:
         ppd.model[...] = stage.previous
     elif schedule.confined and look_at(ppd, bounds, record) and record.stop_code == CONVERGED:
@@ -262,6 +254,17 @@ def _begin(ppd, bounds, schedule):
     stage = Stage(ppd.model.copy(), support=SignificantSupport(schedule.significance) if schedule.confined else None)
     stage.record.bounds.append((0, bounds.l2_bounds.copy()))
     return stage
+
+
+def _begin_next(ppd, bounds, schedule, stage):
+    """The next problem, or the last one anew; return False where nothing would change."""
+    if stage.last:
+        return schedule.confined and _structure_falls(ppd, bounds, schedule, stage)
+    if _renew_weights(ppd, bounds, schedule, stage):
+        stage.start, stage.settled = ppd.iteration, 0
+    else:
+        _begin_last(ppd, bounds, stage)
+    return True
 
 
 def _begin_last(ppd, bounds, stage):
