@@ -69,8 +69,9 @@ def main() -> None:
     from casa_sara.solver import reweighting
 
     print(machine())
-    print("\n| visibilities | the last problem ends | structure, σ | residual / noise | dB at 1, 2, 4 pixels | iterations "
-          "| s |\n" + "|---" * 7 + "|")
+    head = ("visibilities", "the last problem ends", "structure, σ", "residual / noise", "dB at 1, 2, 4 pixels",
+            "iterations", "s")
+    print("\n| " + " | ".join(head) + " |\n" + "|---" * len(head) + "|")
     sky = truth()
     for number in options.visibilities:
         folder = options.folder / f"{number:.0e}"

@@ -3,7 +3,8 @@
 import os
 import tempfile
 
-os.environ.setdefault("OMP_NUM_THREADS", "2")  # before anything starts OpenMP: the same on every machine
+# Before anything starts OpenMP: the same on every machine, and one for each of several processes of tests.
+os.environ.setdefault("OMP_NUM_THREADS", "1" if "PYTEST_XDIST_WORKER" in os.environ else "2")
 os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("HYPOTHESIS_STORAGE_DIRECTORY", os.path.join(tempfile.gettempdir(), "casa_sara-hypothesis"))
 
