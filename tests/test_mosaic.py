@@ -431,6 +431,7 @@ def line(folder):
 CUBE = GRID | dict(imsize=[160, 150], specmode="cube", outframe="LSRK", interpolation="nearest")
 
 
+@pytest.mark.slow
 def test_dirty_cube_of_a_mosaic_is_near_tcleans(line, tmp_path, monkeypatch):
     """Channel by channel; of the first channel also the image of that channel alone. Flagged in one: weaker there."""
     import casatasks
