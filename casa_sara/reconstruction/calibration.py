@@ -14,7 +14,6 @@ from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["Calibration"]
 
-LARGEST = 0.1  # |g_p + g_q*| that is looked for where nothing else shows how large the errors are
 
 
 class Calibration:
@@ -57,7 +56,7 @@ class Calibration:
 
         Where |g_p + g_q*| is δ in the rms, δ‖Σ^{−½}Φx‖ of the data is moved in all.  Emission of less than this S/N is
         in doubt: it may have been fitted to that.  So the gains are those that explain what the rest of the model
-        leaves, for the δ that is found while all of it is taken for sky, or else for δ = 0.1.
+        leaves, where what all of it leaves has shown δ.
 
         Parameters
         ----------
@@ -77,14 +76,8 @@ class Calibration:
         left = _Left(self._operator, self._vis, model, np.repeat(
             np.sqrt(noise_weights[:len(self._offsets) - 1]).astype(self._vis.real.dtype), np.diff(self._offsets)))
         total = float(np.sqrt(self._comm.total(float(np.vdot(left.predicted, left.predicted).real))))
-        self.found = None
-        for moved in (0.0, LARGEST):
-            if moved:
-                left.take_for_sky(model - in_doubt(moved * total))
-            errors = gains.fit(left.predicted, left.residual)
-            if errors.believed:
-                self.found = errors
-                break
+        errors = gains.fit(left.predicted, left.residual)
+        self.found = errors if errors.believed else None
         if self.found is None:
             return None
         left.take_for_sky(model - in_doubt(self.found.moved * total))
