@@ -205,6 +205,7 @@ class SolverOptions:
     finalreltol: float = 3e-4
     regscale: float = 1.0
     significance: float = 5.0
+    gainfit: bool = False
     ndraws: int = 0
     jackknife: bool = False
     nthreads: int = 1

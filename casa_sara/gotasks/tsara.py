@@ -21,8 +21,9 @@ class _tsara(ShellTask):
         wavelevels=None, usemask=None, mask=None, pbmask=None, positivity=None, polbound=None, precondition=None,
         databound=None, boundtol=None, boundrelchange=None, boundstep=None, boundinterval=None, l2bound=None,
         nreweights=None, reweightdecay=None, reweighttol=None, reltol=None, finalreltol=None, regscale=None,
-        significance=None, ndraws=None, jackknife=None, blocks=None, nthreads=None, dryrun=None, maxmem=None,
-        maxtime=None, fullsummary=None, report=None, restart=None, overwrite=None, savemodel=None, parallel=None,
+        significance=None, gainfit=None, ndraws=None, jackknife=None, blocks=None, nthreads=None, dryrun=None,
+        maxmem=None, maxtime=None, fullsummary=None, report=None, restart=None, overwrite=None, savemodel=None,
+        parallel=None,
     ):
         """Run the task, with the values in the shell where no argument is given."""
         given = dict(locals())

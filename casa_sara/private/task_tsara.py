@@ -322,12 +322,16 @@ def _check_stokes(parameters):
 
 
 def _check_method(parameters):
-    """Raise on parameters that the algorithm of the paper does not have."""
+    """Raise on parameters that the algorithm of the paper does not have, or a model that nothing confines."""
     method = parameters["method"]
+    if parameters["gainfit"] and not parameters["significance"]:
+        raise ValueError("gainfit = True with significance = 0: nothing confines the model; should be False, or "
+                         "significance above 0")
     if method == "tsara":
         return
     for name, right, reason in (("regscale", 1.0, "its prior has no weight that depends on the noise"),
                                 ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
+                                ("gainfit", False, "it leaves the model free everywhere"),
                                 ("ndraws", 0, "its errors are not known from draws"),
                                 ("jackknife", False, "its errors are not known from draws"),
                                 ("parallel", False, "it runs in one process")):

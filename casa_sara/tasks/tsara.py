@@ -562,6 +562,15 @@ class _tsara:
         Detection is repeated at every re-weighting (nreweights). With 0 the model is free everywhere;
         at low signal-to-noise ratios it then also contains the positive peaks of the noise.
 
+    gainfit : bool, default False
+        True fits errors of the antenna gains, for each scan or each integration, to what the model
+        leaves of the visibilities, and looks for emission in the residual without what they explain.
+        The data, the residual image and the noise levels stay as they are; the log, and 'gain_errors'
+        in the record, say how large the errors are. For snapshots and short observations whose
+        islands around a bright source are suspected to be artefacts; self-calibration is what
+        removes the errors. Where extended emission is missing from the model, as when the shortest
+        baselines do not measure it, the fit takes some of it for errors: compare both images.
+
     ndraws : int, default 0
         The sky of the model is observed again, with new noise at the levels found for each block, and
         solved again: this many times, from the solution on, with its support and weights found anew.
@@ -722,9 +731,9 @@ class _tsara:
         wavelets=['dirac', 'db1', 'db2', 'db3', 'db4', 'db5', 'db6', 'db7', 'db8'], wavelevels=4, usemask='user',
         mask='', pbmask=0.0, positivity=True, polbound=False, precondition=True, databound='adapt', boundtol=0.01,
         boundrelchange=0.01, boundstep=0.618, boundinterval=20, l2bound=[], nreweights=20, reweightdecay=0.618,
-        reweighttol=0.01, reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, ndraws=0, jackknife=False,
-        blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False, restart=False,
-        overwrite=False, savemodel='none', parallel=False,
+        reweighttol=0.01, reltol=0.0003, finalreltol=0.0003, regscale=1.0, significance=5.0, gainfit=False, ndraws=0,
+        jackknife=False, blocks=0, nthreads=0, dryrun=False, maxmem=0.0, maxtime='', fullsummary=False, report=False,
+        restart=False, overwrite=False, savemodel='none', parallel=False,
     ):
         """Run the task."""
         values = dict(locals())
