@@ -115,6 +115,19 @@ def small_prior(nterms, shape=(4, 4), dtype=np.float64):
     return SubbandDictionary(one, subbands.orders), one, subbands
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_prior_is_the_same_to_the_last_bit_for_any_number_of_threads(dtype):
+    _, _, subbands = octave(3)
+    shape, rng = (96, 130), np.random.default_rng(7)
+    image = rng.standard_normal((3 * shape[0], shape[1])).astype(dtype)
+    coefs = [SubbandDictionary(SaraDictionary(shape, ("dirac", "db2"), 2, dtype, nthreads=count), subbands.orders,
+                               count).analysis(image) for count in (1, 2, 3)]
+    np.testing.assert_array_equal(coefs[0], coefs[1])
+    np.testing.assert_array_equal(coefs[0], coefs[2])
+    orders = np.einsum("kt,txy->kxy", subbands.orders, image.reshape(3, *shape).astype(float))
+    np.testing.assert_allclose(coefs[0][:, 0, :, :shape[1]], orders / np.sqrt(2), atol=1e-5)
+
+
 def test_prior_is_that_of_the_orders_of_the_spectra():
     rng = np.random.default_rng(3)
     prior, one, subbands = small_prior(3)

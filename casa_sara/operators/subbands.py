@@ -23,10 +23,14 @@ import numpy as np
 from scipy.linalg import eigh_tridiagonal
 
 from casa_sara.operators._arguments import for_adjoint, for_forward
+from casa_sara.operators._workers import Workers
 from casa_sara.operators.dictionary import Band, SaraDictionary
 from casa_sara.operators.modulated import add_term, take_term
+from casa_sara.runtime import jit
 
 __all__ = ["SubbandDictionary", "SubbandOperator", "Subbands"]
+
+PIXELS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
@@ -252,14 +256,17 @@ class SubbandDictionary:
         Of one image.
     orders : float (T, T)
         F.
+    nthreads : int
+        Threads.
     """
 
-    def __init__(self, dictionary: SaraDictionary, orders: np.ndarray) -> None:
+    def __init__(self, dictionary: SaraDictionary, orders: np.ndarray, nthreads: int = 1) -> None:
         self._dictionary, self.n_bases = dictionary, dictionary.n_bases
         self._orders = np.ascontiguousarray(orders, dictionary.dtype)
         self._back = np.ascontiguousarray(self._orders.T)
         self.shape = (len(orders) * dictionary.shape[0], dictionary.shape[1])
         self._in, self._out = (np.empty((len(orders), *dictionary.shape), dictionary.dtype) for _ in range(2))
+        self._workers = Workers(nthreads)
 
     def allocate(self) -> np.ndarray:
         """Return an array of coefficients, all 0."""
@@ -373,10 +380,24 @@ class SubbandDictionary:
             self._dictionary.scale_at(one, pixels, factor)
 
     def _mixed(self, matrix, image, out):
-        np.dot(matrix, image.reshape(len(matrix), -1), out=out.reshape(len(matrix), -1))
+        self._workers.run(_combine, matrix, image.reshape(len(matrix), -1), out.reshape(len(matrix), -1))
         return out
 
     def _unmixed(self, out):
         out = np.empty(self.shape, self._dictionary.dtype) if out is None else out
         self._mixed(self._back, self._out, out)
         return out
+
+
+@jit.kernel(fastmath={"contract"})
+def _combine(matrix, images, out, worker, workers):
+    """out_s ← Σ_t matrix_st images_t, all (T, n), to the same last bit for any number of workers: BLAS promises none."""
+    size = images.shape[1]
+    for start in range(PIXELS_AT_ONCE * worker, size, PIXELS_AT_ONCE * workers):
+        stop = min(start + PIXELS_AT_ONCE, size)
+        for s in range(len(matrix)):
+            for k in range(start, stop):
+                out[s, k] = matrix[s, 0] * images[0, k]
+            for t in range(1, len(matrix)):
+                for k in range(start, stop):
+                    out[s, k] += matrix[s, t] * images[t, k]

@@ -230,7 +230,7 @@ class Problem:
         each = [SaraDictionary(shape, wavelets, options.wavelevels, nthreads=options.nthreads,
                                n_bases=len(options.wavelets)) for shape in self.shapes]
         if self.subbands is not None:
-            return SubbandDictionary(each[0], self.subbands.orders)
+            return SubbandDictionary(each[0], self.subbands.orders, options.nthreads)
         return each[0] if len(each) == 1 else ImagesDictionary(each)
 
     @property
