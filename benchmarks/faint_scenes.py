@@ -21,7 +21,8 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-__all__ = ["FINER", "SETS", "Scene", "Truth", "binned", "simulate"]
+__all__ = ["FINER", "SETS", "Scene", "Truth", "binned", "dirty_image", "gaussian", "natural_beam", "simulate",
+           "write_observed"]
 
 FINER = 3
 FLUX_JY = 0.1
@@ -254,8 +255,6 @@ def natural_beam(uvw) -> tuple[float, float, float]:
 
 def simulate(scene: Scene, folder: Path) -> None:
     """Write obs.ms and truth.npz unless they are there."""
-    from casatools import table
-
     from casa_sara.demo.imagers import quiet
     from casa_sara.demo.predict import predict
     from casa_sara.demo.sky import ARCSEC, Sky
@@ -276,9 +275,17 @@ def simulate(scene: Scene, folder: Path) -> None:
     noise = BLANK_NOISE_JY
     if scene.sky != "blank":
         noise = dirty_image(vis, uvw, cell, scene.size).max() / scene.peak
+    write_observed(folder, rng, vis, noise)
+    np.savez_compressed(folder / "truth.npz", fine=fine.astype(np.float32), img=binned(fine), cell_arcsec=cell / ARCSEC,
+                        noise=noise, beam=beam, visibilities=vis.size)
+
+
+def write_observed(folder: Path, rng, vis: np.ndarray, noise: float) -> None:
+    """Write visibilities into both correlations of obs.ms, with noise that is `noise` in the natural dirty image."""
+    from casatools import table
+
     sigma = noise * np.sqrt(2 * vis.size)  # of Re and of Im of one correlation
     draw = rng.standard_normal((2, 2, vis.size))
-
     tb = table()
     tb.open(str(folder / "obs.ms"), nomodify=False)
     shape = tb.getcol("DATA").shape
@@ -286,5 +293,3 @@ def simulate(scene: Scene, folder: Path) -> None:
     tb.putcol("SIGMA", np.full((2, shape[2]), sigma))
     tb.putcol("WEIGHT", np.full((2, shape[2]), sigma**-2))
     tb.close()
-    np.savez_compressed(folder / "truth.npz", fine=fine.astype(np.float32), img=binned(fine), cell_arcsec=cell / ARCSEC,
-                        noise=noise, beam=beam, visibilities=vis.size)

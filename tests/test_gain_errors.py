@@ -242,3 +242,26 @@ def test_what_gain_errors_make_is_no_emission(rms):
     assert found.record.gain_errors["phase"] == pytest.approx(rms, rel=0.3)
     before = reconstruct(samples, GRID, SolverOptions(nthreads=1))
     assert before.model[outside].sum() > 0.1 and found.model[outside].sum() < 0.01
+
+
+@pytest.mark.parametrize(("wrong", "words"), [
+    (dict(significance=0), "gainfit = True with significance = 0.* above 0"),
+    (dict(method="dabbech2018"), "gainfit = True with method = 'dabbech2018'.*should be False")])
+def test_fit_of_gains_is_refused_where_nothing_confines_the_model(wrong, words, tmp_path):
+    pytest.importorskip("casatools")
+    from casa_sara import tsara
+
+    with pytest.raises(ValueError, match=words):
+        tsara(vis=str(tmp_path), imagename="none", imsize=32, cell="1arcsec", gainfit=True, **wrong)
+
+
+def test_memory_of_the_fit_is_forecast():
+    pytest.importorskip("casatools")
+    from casa_sara.casa.ms.data_volume import DataVolume
+    from casa_sara.imaging.memory_forecast import GAINS, PASSING, Workload
+
+    volume, phases = DataVolume(1_000_000, (1e5, 1e5)), []
+    for gainfit in (False, True):
+        work = Workload.of(volume, GRID, SolverOptions(averaging=False, gainfit=gainfit))
+        phases.append(work.memory()["iterating"]["re-weighting"])
+    assert phases == [PASSING * 1_000_000, GAINS * 1_000_000]

@@ -290,7 +290,8 @@ def test_forecast_of_many_visibilities():
 def test_what_cannot_be_on_the_disk_is_in_memory(changed, on_disk):
     grid = replace(ImageGrid((64, 64), (1e-6, 1e-6)), **changed)
     assert dry_run._may_be_on_disk(grid, SolverOptions(), Limits(), SERIAL) is on_disk
-    for options in (SolverOptions(method="dabbech2018"), SolverOptions(databound="weights")):
+    for options in (SolverOptions(method="dabbech2018"), SolverOptions(databound="weights"),
+                    SolverOptions(gainfit=True)):
         assert not dry_run._may_be_on_disk(grid, options, Limits(), SERIAL)
     assert not dry_run._may_be_on_disk(grid, SolverOptions(), Limits(report=True), SERIAL)
 

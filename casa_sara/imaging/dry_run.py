@@ -79,9 +79,10 @@ def forecast_run(selection, grid, options, limits, comm=SERIAL, blocks=0, disk=T
 def _may_be_on_disk(grid, options, limits, comm):
     """Whether samples can be kept on the disk: those of one image that are averaged for the solver, of one process.
 
-    The report has all of them in memory.
+    The report and the fit of gains have all of them in memory.
     """
-    return (comm.size == 1 and not (grid.is_cube or grid.is_mosaic or grid.outliers or limits.report)
+    return (comm.size == 1
+            and not (grid.is_cube or grid.is_mosaic or grid.outliers or limits.report or options.gainfit)
             and grid.nterms == 1 and len(grid.stokes) == 1 and (options.averages or options.niter == 0))
 
 

@@ -61,9 +61,9 @@ def _log_islands(record, significance, cell_rad):
         log.info(f"  and {len(faint)} fainter islands in their surroundings, {sum(faint):.2g} Jy together")
     _compare_errors(islands)
     if record.gain_errors:
-        log.warn("the residual shows errors of the antenna gains that change from {interval} to {interval}: "
-                 "{amplitude:.2%} in amplitude and {degrees:.2g} degrees in phase (rms). What they explain is not "
-                 "taken for emission; self-calibration would remove them"
+        log.warn("the residual visibilities show antenna gain errors that change from {interval} to {interval}: "
+                 "{amplitude:.2%} in amplitude and {degrees:.2g} degrees in phase (rms). What they explain is kept out "
+                 "of the model (gainfit = True); self-calibration would remove them"
                  .format(**record.gain_errors, degrees=math.degrees(record.gain_errors["phase"])))
     worst = max((peak for peak in record.residual_snr if peak["beams"] >= 1), key=lambda peak: peak["snr"],
                 default=None)

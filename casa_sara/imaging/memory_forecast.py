@@ -32,6 +32,7 @@ AVERAGED = 16  # of all: whitened, the numbers of their cells, the density
 PARTS = 28  # of all, of a mosaic: place and phase in the part of the image that it sees
 AVERAGE = 72  # of an average: that of SOLVER, POINT and the sums of its cell
 RENEWING = 24  # of all: residual and its sums
+GAINS = 28  # of all: predicted, residual, noise, and what islands in doubt predict
 # samples on the disk: of each, of each of the largest block, and of each of a piece that is worked on
 HELD, OF_BLOCK, OF_PIECE = 12, 70, 160
 FILLED = 0.5  # of the uv cells within reach, at most
@@ -83,6 +84,7 @@ class Workload:
     draws: int = 0  # of bootstrap and jackknife
     duals: int = 2  # arrays of coefficients: the dual, its weights, and a scratch of the paper's prior
     averages: bool = False  # visibilities may be averaged
+    gainfit: bool = False  # gains are fitted to all of them
     on_disk: bool = False  # and are kept on the disk
     blocks: int = 0  # asked for; 0 for those of the automatic rule
     nterms: int = 1  # images that are solved for together
@@ -105,7 +107,7 @@ class Workload:
                    confined=options.method == "tsara" and options.significance > 0 and options.nreweights > 0,
                    draws=options.ndraws + options.jackknife * MOST_GROUPS,
                    duals=3 if options.method == "dabbech2018" else 2,
-                   averages=options.averages, nterms=grid.nterms, stokes=len(grid.stokes),
+                   averages=options.averages, gainfit=options.gainfit, nterms=grid.nterms, stokes=len(grid.stokes),
                    together=max(1, len(grid.stokes) - 1) if options.polbound and grid.stokes[0] == "I" else 1,
                    outliers=grid.shapes[1:])
 
@@ -186,7 +188,7 @@ class Workload:
         with_solver = with_operator | self._solver()
         iterating = with_solver | {
             "image planes": self._planes(PLANE + SOLVING * self.nterms + MATCHED * self.confined + self._mixing()),
-            "re-weighting": (RENEWING if self.averages else PASSING) * self.samples,
+            "re-weighting": max(RENEWING if self.averages else PASSING, GAINS * self.gainfit) * self.samples,
             "wavelet duals and weights": self.duals * self.nterms * coefs,
             "wavelet workspace": workspace}
         phases = {}

@@ -39,7 +39,7 @@ def sky_operator(uvw: np.ndarray, grid: ImageGrid,  # noqa: PLR0913 - seven have
                  dtype: npt.DTypeLike = np.float32,
                  nthreads: int | Workers = 1, comm: Serial = SERIAL, beam: np.ndarray | None = None,
                  ) -> (MeasurementOperator | ModulatedOperator | MosaicOperator | SubbandOperator | ImagesOperator
-          | WGridder | NoVisibilities):
+                       | WGridder | NoVisibilities):
     """Return the measurement operator of an image, with its outliers where it has some.
 
     Parameters

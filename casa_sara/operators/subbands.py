@@ -391,7 +391,7 @@ class SubbandDictionary:
 
 @jit.kernel(fastmath={"contract"})
 def _combine(matrix, images, out, worker, workers):
-    """out_s ← Σ_t matrix_st images_t, all (T, n), to the same last bit for any number of workers: BLAS promises none."""
+    """out_s ← Σ_t matrix_st images_t, all (T, n): to the last bit for any number of workers, which BLAS is not."""
     size = images.shape[1]
     for start in range(PIXELS_AT_ONCE * worker, size, PIXELS_AT_ONCE * workers):
         stop = min(start + PIXELS_AT_ONCE, size)

@@ -100,7 +100,7 @@ TSARA = (
     Parameter('finalreltol', ('double',), 0.0003, 'The same after the last re-weighting', minimum=0.0, maximum=1.0),
     Parameter('regscale', ('double',), 1.0, 'Multiplier on the automatic weight of the sparsity prior', minimum=0.0),
     Parameter('significance', ('double',), 5.0, 'Signal-to-noise ratio above which emission enters the model; 0 for no limit', minimum=0.0),
-    Parameter('gainfit', ('bool',), False, 'Take what errors of the antenna gains explain not for emission'),
+    Parameter('gainfit', ('bool',), False, 'Keep artefacts of antenna gain errors out of the model'),
     Parameter('ndraws', ('int',), 0, 'Draws of the bootstrap that gives the errors of the model; 0: none, 20 are usual', minimum=0.0),
     Parameter('jackknife', ('bool',), False, 'Find errors from solutions that leave out one group of snapshots each'),
     Parameter('blocks', ('int', 'string', 'stringVec'), 0, 'Data blocks, each with its own noise level: 0 for one per snapshot, a number, or selections of data'),

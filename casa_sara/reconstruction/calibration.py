@@ -15,7 +15,6 @@ from casa_sara.parallel.serial import SERIAL, Serial
 __all__ = ["Calibration"]
 
 
-
 class Calibration:
     """Artefacts of gain errors in the image of a residual.
 
@@ -81,7 +80,8 @@ class Calibration:
         if self.found is None:
             return None
         left.take_for_sky(model - in_doubt(self.found.moved * total))
-        left.predicted *= gains.fit(left.predicted, left.residual).factors[self._data.row]
+        factors = gains.fit(left.predicted, left.residual).factors.astype(left.predicted.dtype)
+        left.predicted *= factors[self._data.row]
         left.predicted *= left.whitening
         return Summed(self._operator, self._comm).adjoint(left.predicted)
 

@@ -177,12 +177,7 @@ class Problem:
         vis: Any = None if data.scratch.on_disk else data.vis * np.sqrt(data.weight)
         measurement = _whitened_operator(data, operator, grid, options, unit_jy)
         precond = of_samples = _preconditioner(samples, options.precondition, comm, grid.subbands)
-        calibration = None
-        if options.gainfit:
-            if vis is None:
-                raise ValueError("gainfit = True: gains are not fitted to visibilities that do not fit into memory; "
-                                 "should be False")
-            calibration = Calibration(data, vis, offsets, measurement, comm)
+        calibration = Calibration(data, vis, offsets, measurement, comm) if options.gainfit else None
         averaged = None
         if options.averages:
             parts = grid.mosaic and parts_of(grid.mosaic, data.uvw, np.asarray(data.beam))

@@ -77,12 +77,12 @@ class SignificantSupport:
         if self._noise_weights is None or not np.array_equal(self._noise_weights, bounds.noise_weights):
             self._psfs = [point_response(ppd, bounds, part) for part in range(len(planes.parts))]
             self._filters, self._noise_weights = [None] * len(planes.parts), bounds.noise_weights
-        artefacts = None
+        whole = without = planes.means(gradient)
         if self.begun and calibration is not None:
             artefacts = calibration.artefacts(ppd.model, bounds.noise_weights, partial(self._faint, ppd))
-        without = planes.means(gradient if artefacts is None else gradient - artefacts)
-        images = zip(planes.means(gradient), without, planes.means(ppd.model),
-                     planes.allowed(ppd.confined_to, ppd.model))
+            if artefacts is not None:
+                without = planes.means(gradient - artefacts)
+        images = zip(whole, without, planes.means(ppd.model), planes.allowed(ppd.confined_to, ppd.model))
         found = [ppd.comm.once(self._found, part, *image, ppd.positivity, ppd.measurement.workers.count)
                  for part, image in enumerate(images)]
         self.begun = True
@@ -106,7 +106,8 @@ class SignificantSupport:
             level = np.clip(filter_.sidelobe * snr.max(), self.significance, SURE * self.significance)
             support = _connected(snr, level)
         else:
-            excess = _excess(filter_.snr(filter_.spectrum(whole), 0), model == 0)
+            noisy = spectrum if whole is gradient else filter_.spectrum(whole)
+            excess = _excess(filter_.snr(noisy, 0), model == 0)
             support = self._grown(filter_, spectrum, model, signed, self.significance * excess)
         if not positivity or not support.any():
             return support, PointSources()

@@ -563,13 +563,13 @@ class _tsara:
         at low signal-to-noise ratios it then also contains the positive peaks of the noise.
 
     gainfit : bool, default False
-        True fits errors of the antenna gains, for each scan or each integration, to what the model
-        leaves of the visibilities, and looks for emission in the residual without what they explain.
-        The data, the residual image and the noise levels stay as they are; the log, and 'gain_errors'
-        in the record, say how large the errors are. For snapshots and short observations whose
-        islands around a bright source are suspected to be artefacts; self-calibration is what
-        removes the errors. Where extended emission is missing from the model, as when the shortest
-        baselines do not measure it, the fit takes some of it for errors: compare both images.
+        True fits errors of the antenna gains, of each scan or each integration, to the residual
+        visibilities, and detects emission in the residual image without what these errors explain.
+        The data, the residual image and the noise levels are not changed; the log, and 'gain_errors'
+        in the record, say how large the errors are. Use it for snapshots and short observations with
+        suspicious islands around a bright source; only self-calibration removes the errors. Where the
+        model lacks extended emission, because the shortest baselines do not measure it, part of it is
+        mistaken for gain errors: compare the image with that of gainfit=False.
 
     ndraws : int, default 0
         The sky of the model is observed again, with new noise at the levels found for each block, and
