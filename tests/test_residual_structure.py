@@ -8,8 +8,9 @@ from test_averaging import fourier
 from test_gain_errors import GRID, snapshots
 
 from casa_sara.options import SolverOptions
+from casa_sara.reconstruction.checkpoint import Checkpoint
 from casa_sara.reconstruction.problem import Samples
-from casa_sara.reconstruction.reconstruct import reconstruct
+from casa_sara.reconstruction.reconstruct import Control, reconstruct
 from casa_sara.solver import reweighting
 from casa_sara.solver.reweighting import Schedule
 
@@ -62,3 +63,27 @@ def test_it_does_not_go_on_for_ever(monkeypatch):
     assert 8 * INTERVAL <= last <= 10 * INTERVAL + 5
     monkeypatch.setattr(reweighting, "structure_of", lambda ppd, bounds: pytest.fail("nothing confines the model"))
     reconstruct(observed(), GRID, SolverOptions(nthreads=1, significance=0))
+
+
+@pytest.mark.parametrize("averaging", [True, False])
+def test_a_last_problem_that_went_on_is_continued_to_the_same_image(averaging, monkeypatch, tmp_path):
+    """Averages were made anew when it went on."""
+    monkeypatch.setattr(reweighting, "LONGEST", 8)
+    monkeypatch.setattr(reweighting, "structure_of", lambda ppd, bounds: 1e3 * 0.99**ppd.iteration)
+    samples, options = observed(integrations=40), SolverOptions(nthreads=1, averaging=averaging)
+    path, reached = str(tmp_path / "c"), [0]
+
+    def run(stop_at=None):
+        checkpoint = Checkpoint(path, "1", {})
+        if stop_at is None:
+            checkpoint.open()
+        return reconstruct(samples, GRID, options, control=Control(
+            lambda ppd, record: reached.__setitem__(0, ppd.iteration), lambda: reached[0] == stop_at, checkpoint))
+
+    wanted = reconstruct(samples, GRID, options)
+    assert bool(wanted.averaging) is averaging
+    end = wanted.record.iteration[-1]
+    run(end - 40)
+    found = run()
+    assert found.record.resumed == [end - 40] and found.record.iteration[-1] == end
+    np.testing.assert_array_equal(found.model, wanted.model)

@@ -97,7 +97,7 @@ class Stage:
     Attributes
     ----------
     previous : real (nx, ny)
-        Model of the problem before, for which averaged samples are exact.
+        Model for which averaged samples are exact, that of the problem before.
     last : bool
         The weights will not change any more.
     start : int
@@ -146,7 +146,8 @@ class Stage:
         -------
         Stage
         """
-        stage = cls(np.array(state["previous"]), state["last"], state["start"], state["settled"])
+        names = ("last", "start", "settled", "structure", "until")
+        stage = cls(np.array(state["previous"]), **{name: state[name] for name in names})
         stage.release.set_state(state["release"])
         stage.support = state["support"] and SignificantSupport(**state["support"])
         stage.record.set_state(state["record"])
@@ -270,7 +271,7 @@ def _begin_next(ppd, bounds, schedule, stage):
 def _begin_last(ppd, bounds, stage):
     """The last problem, with the weights as they are."""
     if ppd.averaged is not None and ppd.averaged.costly:
-        ppd.renew_averages(ppd.model)
+        _renew_averages(ppd, stage)
     bounds.finish(ppd)
     stage.last, stage.start, stage.settled = True, ppd.iteration, 0
 
@@ -283,9 +284,15 @@ def _structure_falls(ppd, bounds, schedule, stage):
     if not STRUCTURE < stage.structure < FALLING * before:
         return False
     if ppd.averaged is not None and not ppd.averaged.costly:
-        ppd.renew_averages(ppd.model)
+        _renew_averages(ppd, stage)
     stage.until, stage.settled = ppd.iteration + schedule.interval, 0
     return True
+
+
+def _renew_averages(ppd, stage):
+    """Make the averages exact for the present model, which a solution that is continued makes them for, too."""
+    stage.previous[...] = ppd.model
+    ppd.renew_averages(stage.previous)
 
 
 def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
