@@ -33,7 +33,7 @@ from casa_sara.imaging.run_solver import (
     density_of,
     expected_iterations,
     log_end,
-    reduced_chi2,
+    show_progress,
     without_wild,
 )
 from casa_sara.imaging.time_forecast import Pace
@@ -143,8 +143,8 @@ def _solve(request, plane, parts, watch):
 
         problems = []
         for number, (stokes, part) in enumerate(zip(grid.stokes, parts)):
-            report = partial(_report, progress, preparing, schedule_of(options).expected_iterations,
-                             None if number else watch.pace, (stokes, number, len(parts)))
+            report = partial(show_progress, progress, preparing, schedule_of(options).expected_iterations,
+                             None if number else watch.pace, (f"Stokes {stokes}: ", number, len(parts)))
             control = Control(report, stopped, tell=partial(_tell, stokes))
             start = None if plane.startmodel is None else plane.startmodel[number]
             samples = Samples(part.data, part.offsets, density, part.noise)
@@ -166,19 +166,6 @@ def _solve(request, plane, parts, watch):
 
 def _tell(stokes, line):
     log.info(f"Stokes {stokes}: {line}")
-
-
-def _report(progress, preparing, expected, pace, place, ppd, record):
-    """Show how far the solution of one Stokes parameter is; `place` is its name, its number, and how many there are."""
-    stokes, number, count = place
-    preparing.over = True
-    begun = record.resumed[-1] if record.resumed else 0
-    if pace and (line := pace(ppd.iteration - begun)):
-        log.info(line)
-    fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-    progress(ppd.iteration, f"Stokes {stokes}: reduced chi-square "
-             f"{reduced_chi2(record.residual_norm[-1], ppd.samples.sum()):.4g}, model flux {record.model_flux[-1]:.5g} "
-             f"Jy, {record.reweighting[-1]} re-weightings", (number + fraction) / count)
 
 
 def _images(request, plane, parts, found):

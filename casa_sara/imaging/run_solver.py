@@ -32,7 +32,7 @@ from casa_sara.solver.record import CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER,
 from casa_sara.version import __version__
 
 __all__ = ["Preparing", "Watch", "at_odds", "checkpoint_of", "density_of", "expected_iterations", "log_end",
-           "reduced_chi2", "solve_image", "without_wild"]
+           "show_progress", "solve_image", "without_wild"]
 
 AT_ODDS, OF_BRIGHTEST = 3.0, 0.01  # times what a single dish alone leaves, and of its brightest point: a warning
 MOST_NAMED = 20  # wild samples that the log names one by one
@@ -125,8 +125,8 @@ def solve_image(samples: Samples, grid: ImageGrid, options: SolverOptions, start
     """
     progress = log.Progress()
     preparing = Preparing(progress)
-    report = partial(_report, progress, preparing, schedule_of(options).expected_iterations, watch.pace if watch
-                     else None)
+    report = partial(show_progress, progress, preparing, schedule_of(options).expected_iterations,
+                     watch.pace if watch else None, ("", 0, 1))
     with stop_on_interrupt() as pressed:
         def stopped():
             preparing()
@@ -156,17 +156,36 @@ def expected_iterations(options: SolverOptions) -> int:
     return schedule_of(options).expected_iterations + draws * DRAW_ITERATIONS
 
 
-def _report(progress: log.Progress, preparing: Preparing, expected: int, pace: Callable[[int], str] | None, ppd,
-            record):
-    """Show how far the solution is, after every iteration of `expected` ones."""
+def show_progress(progress, preparing, expected, pace, place, ppd, record):
+    """Show how far the solution is, after every iteration of `expected` ones.
+
+    Parameters
+    ----------
+    progress : log.Progress
+        Shows it.
+    preparing : Preparing
+        What was shown before the first iteration.
+    expected : int
+        Iterations.
+    pace : callable or None
+        Takes the iterations that are done, and returns a line for the log, or nothing.
+    place : (str, int, int)
+        What is solved for, where there are several, with ': ', its number, and how many there are.
+    ppd : AdaptivePPD
+        The iteration.
+    record : SolverRecord
+        Its history.
+    """
+    name, number, count = place
     preparing.over = True
     begun = record.resumed[-1] if record.resumed else 0
     if pace and (line := pace(ppd.iteration - begun)):
         log.info(line)
     fraction = min((ppd.iteration - begun) / max(expected - begun, 1), 0.999)
-    progress(ppd.iteration, f"reduced chi-square {reduced_chi2(record.residual_norm[-1], ppd.samples.sum()):.4g}, "
+    progress(ppd.iteration,
+             f"{name}reduced chi-square {_reduced(record.residual_norm[-1], ppd.samples.sum()):.4g}, "
              f"model flux {record.model_flux[-1]:.5g} Jy, relative change of the model {ppd.rel_change:.1e}, "
-             f"{record.reweighting[-1]} re-weightings", fraction)
+             f"{record.reweighting[-1]} re-weightings", (number + fraction) / count)
 
 
 def log_end(reconstruction, offsets, checkpoint=None, comm=SERIAL):
@@ -187,7 +206,7 @@ def log_end(reconstruction, offsets, checkpoint=None, comm=SERIAL):
     say = log.info if record.stop_code in (CONVERGED, ITERATION_LIMIT, STOPPED_BY_USER) else log.warn
     samples = _samples_of_blocks(reconstruction, offsets, comm)
     say(f"{record.stop_description}, after {record.iteration[-1]} iterations and {record.reweighting[-1]} "
-        f"re-weightings: reduced chi-square {reduced_chi2(record.residual_norm[-1], samples.sum()):.4g}, model flux "
+        f"re-weightings: reduced chi-square {_reduced(record.residual_norm[-1], samples.sum()):.4g}, model flux "
         f"{record.model_flux[-1]:.5g} Jy")
     if checkpoint and checkpoint.stands and record.stop_code in UNFINISHED:
         log.info(f"restart = True continues from '{checkpoint.path}'")
@@ -197,8 +216,8 @@ def log_end(reconstruction, offsets, checkpoint=None, comm=SERIAL):
                  "between pixel centres")
     _log_total_power(reconstruction.total_power)
     for j, (bound, norm) in enumerate(zip(reconstruction.l2_bounds, reconstruction.residual_norms)):
-        log.info(f"block {j}: noise found {reduced_chi2(bound, samples[j]) ** 0.5:#.3g} x MS weights, "
-                 f"reduced chi-square {reduced_chi2(norm, samples[j]):.4g}")
+        log.info(f"block {j}: noise found {_reduced(bound, samples[j]) ** 0.5:#.3g} x MS weights, "
+                 f"reduced chi-square {_reduced(norm, samples[j]):.4g}")
 
 
 def _log_total_power(found):
@@ -279,20 +298,8 @@ class Preparing:
         self._progress.prepare(f"NNLS iteration {self._iteration}", due)
 
 
-def reduced_chi2(norm, samples):
-    """Return χ²/2M, the reduced chi-square of M complex samples, of the norm of their whitened residual.
-
-    Parameters
-    ----------
-    norm : float
-        Of the residual.
-    samples : int
-        M.
-
-    Returns
-    -------
-    float
-    """
+def _reduced(norm, samples):
+    """Return χ²/2M, the reduced chi-square of M complex samples, of the norm of their whitened residual."""
     return float(norm) ** 2 / (2.0 * max(int(samples), 1))
 
 

@@ -85,14 +85,7 @@ def cube_summary(result: CubeResult, options: SolverOptions, full: bool = False)
             minor[number] = {0: _minor(channel.result, result.code_of(channel))}
             ends += [done + end for end in minor[number][0]["iterDone"]]
             done = ends[-1] if ends else 0
-    sara = {
-        "version": __version__,
-        "method": options.method,
-        "visibilities": result.data.size,
-        "dropped": dict(result.data.dropped),
-        "notes": list(result.data.notes),
-        "nthreads": options.nthreads,
-        "forecast": dict(result.forecast),
+    sara = _run(result, options, result.data.size) | {
         "outframe": result.frame,
         "channels": [_channel(channel, result.code_of(channel), options, full) for channel in result.channels],
     }
@@ -120,14 +113,7 @@ def polarised_summary(result: PolarisedResult, options: SolverOptions, full: boo
     ends = max((_ends(one) for one in result.planes.values()), key=lambda one: one[-1:])
     minor = {number: _minor(one, result.code_of(stokes))
              for number, (stokes, one) in enumerate(result.planes.items())}
-    sara = {
-        "version": __version__,
-        "method": options.method,
-        "visibilities": result.data.size,
-        "dropped": dict(result.data.dropped),
-        "notes": list(result.data.notes),
-        "nthreads": options.nthreads,
-        "forecast": dict(result.forecast),
+    sara = _run(result, options, result.data.size) | {
         "polbound": options.polbound,
         "polarised_above_jy_per_pixel": result.polarised_above,
         "stokes": [_stokes(stokes, one, sumwt, result.code_of(stokes), options, full)
@@ -187,17 +173,9 @@ def _minor(result, code):
 
 
 def _sara(result, options, full):
-    data = result.data
-    sara = {
-        "version": __version__,
-        "method": options.method,
-        "visibilities": result.size,
-        "dropped": dict(data.dropped),
-        "notes": list(data.notes),
+    sara = _run(result, options, result.size) | {
         "blocks": [_block(result, j) for j in range(len(result.blocks))],
         "suspects": [dict(suspect) for suspect in result.suspects],
-        "nthreads": options.nthreads,
-        "forecast": dict(result.forecast),
     }
     if result.subbands is not None:
         sara["spectra"] = {"frequencies_hz": result.subbands.freqs_hz, "reference_hz": result.subbands.reference_hz,
@@ -205,6 +183,19 @@ def _sara(result, options, full):
     if result.outliers:
         sara["outliers"] = [one.summary() for one in result.outliers]
     return sara | _solution(result, options, full)
+
+
+def _run(result, options, visibilities):
+    """Return what every record begins with."""
+    return {
+        "version": __version__,
+        "method": options.method,
+        "visibilities": visibilities,
+        "dropped": dict(result.data.dropped),
+        "notes": list(result.data.notes),
+        "nthreads": options.nthreads,
+        "forecast": dict(result.forecast),
+    }
 
 
 def _solution(result, options, full):

@@ -233,17 +233,16 @@ def _check_single_dish(parameters):
         raise ValueError(f"sdgain = {parameters['sdgain']!r}: should be positive; 1 leaves the flux scale as it is")
     if not image:
         return
-    for name, right, reason in (("specmode", "mfs", "total power is for continuum images"),
-                                ("stokes", "I", "total power is of Stokes I"),
-                                ("method", "tsara", "the paper has no total power"),
-                                ("databound", "adapt", "the noise of sdimage is found, it has no weights"),
-                                ("spectralindex", "", "the sky has to be the same at all frequencies"),
-                                ("nterms", 1, "the sky has to be the same at all frequencies"),
-                                ("ndraws", 0, "its errors are not found by bootstrap"),
-                                ("jackknife", False, "its errors are not found by jackknife"),
-                                ("parallel", False, "total power takes one process")):
-        if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} with sdimage = '{image}': {reason}; should be {right!r}")
+    _refuse(parameters, f"sdimage = '{image}'", (
+        ("specmode", "mfs", "total power is for continuum images"),
+        ("stokes", "I", "total power is of Stokes I"),
+        ("method", "tsara", "the paper has no total power"),
+        ("databound", "adapt", "the noise of sdimage is found, it has no weights"),
+        ("spectralindex", "", "the sky has to be the same at all frequencies"),
+        ("nterms", 1, "the sky has to be the same at all frequencies"),
+        ("ndraws", 0, "its errors are not found by bootstrap"),
+        ("jackknife", False, "its errors are not found by jackknife"),
+        ("parallel", False, "total power takes one process")))
 
 
 def _refuse_for_spectra(parameters):
@@ -256,13 +255,12 @@ def _refuse_for_spectra(parameters):
     if parameters["gridder"] == "wproject":
         raise ValueError(f"gridder = 'wproject' with nterms = {nterms}: the w-term is modelled of flat, or of known "
                          "spectra; should be 'standard' or 'mosaic'")
-    for name, right, reason in (("method", "tsara", "the paper's method has one image"),
-                                ("stokes", "I", "spectra are those of the brightness"),
-                                ("positivity", True, "the brightness is positive at all frequencies"),
-                                ("spectralindex", "", "either the index is known, or it is solved for"),
-                                ("parallel", False, "spectra take one process")):
-        if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} with nterms = {nterms}: {reason}; should be {right!r}")
+    _refuse(parameters, f"nterms = {nterms}", (
+        ("method", "tsara", "the paper's method has one image"),
+        ("stokes", "I", "spectra are those of the brightness"),
+        ("positivity", True, "the brightness is positive at all frequencies"),
+        ("spectralindex", "", "either the index is known, or it is solved for"),
+        ("parallel", False, "spectra take one process")))
 
 
 def _refuse_for_outliers(parameters):
@@ -270,21 +268,18 @@ def _refuse_for_outliers(parameters):
     name = parameters["outlierfile"]
     if not name:
         return
-    for parameter, right, reason in (("specmode", "mfs", "outliers are of continuum images"),
-                                     ("gridder", ("standard", "wproject"), "outliers are of single pointings"),
-                                     ("stokes", "I", "outliers are of Stokes I"),
-                                     ("method", "tsara", "the paper has one image"),
-                                     ("nterms", 1, "the spectra of outliers are flat"),
-                                     ("spectralindex", "", "the spectra of outliers are flat"),
-                                     ("sdimage", "", "total power is of one image"),
-                                     ("ndraws", 0, "errors by bootstrap are of one image"),
-                                     ("jackknife", False, "errors by jackknife are of one image"),
-                                     ("report", False, "reports are made of one image"),
-                                     ("parallel", False, "outliers take one process")):
-        allowed = right if isinstance(right, tuple) else (right,)
-        if parameters[parameter] not in allowed:
-            raise ValueError(f"{parameter} = {parameters[parameter]!r} with outlierfile = '{name}': {reason}; should "
-                             f"be {' or '.join(map(repr, allowed))}")
+    _refuse(parameters, f"outlierfile = '{name}'", (
+        ("specmode", "mfs", "outliers are of continuum images"),
+        ("gridder", ("standard", "wproject"), "outliers are of single pointings"),
+        ("stokes", "I", "outliers are of Stokes I"),
+        ("method", "tsara", "the paper has one image"),
+        ("nterms", 1, "the spectra of outliers are flat"),
+        ("spectralindex", "", "the spectra of outliers are flat"),
+        ("sdimage", "", "total power is of one image"),
+        ("ndraws", 0, "errors by bootstrap are of one image"),
+        ("jackknife", False, "errors by jackknife are of one image"),
+        ("report", False, "reports are made of one image"),
+        ("parallel", False, "outliers take one process")))
 
 
 def _refuse_for_several_stokes(parameters):
@@ -292,16 +287,13 @@ def _refuse_for_several_stokes(parameters):
     stokes = parameters["stokes"]
     if len(stokes) == 1:
         return
-    for name, right, reason in (("specmode", "mfs", "they are continuum images"),
-                                ("gridder", ("standard", "wproject"), "mosaics are of one Stokes parameter"),
-                                ("method", "tsara", "the paper's method has one image"),
-                                ("parallel", False, "they take one process"),
-                                ("ndraws", 0, "errors by bootstrap are of one image"),
-                                ("jackknife", False, "errors by jackknife are of one image")):
-        allowed = right if isinstance(right, tuple) else (right,)
-        if parameters[name] not in allowed:
-            raise ValueError(f"{name} = {parameters[name]!r} with stokes = '{stokes}': {reason}; should be "
-                             f"{' or '.join(map(repr, allowed))}")
+    _refuse(parameters, f"stokes = '{stokes}'", (
+        ("specmode", "mfs", "they are continuum images"),
+        ("gridder", ("standard", "wproject"), "mosaics are of one Stokes parameter"),
+        ("method", "tsara", "the paper's method has one image"),
+        ("parallel", False, "they take one process"),
+        ("ndraws", 0, "errors by bootstrap are of one image"),
+        ("jackknife", False, "errors by jackknife are of one image")))
     if "I" in stokes and parameters["polbound"] and not parameters["positivity"]:
         raise ValueError(f"positivity = False with stokes = '{stokes}' and polbound = True: where |(Q, U, V)| is at "
                          "most I, I is not negative; should be True, or polbound = False")
@@ -313,12 +305,10 @@ def _check_stokes(parameters):
     if stokes == "I":
         return
     signed = (("positivity", False, "the image may be negative"),) if "I" not in stokes else ()
-    for name, right, reason in (*signed,
-                                ("savemodel", "none", "MODEL_DATA is written for Stokes I only"),
-                                ("report", False, "reports are made for Stokes I only")):
-        if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} is not possible with stokes = '{stokes}', {reason}: set "
-                             f"{name} = {right!r}")
+    _refuse(parameters, f"stokes = '{stokes}'", (
+        *signed,
+        ("savemodel", "none", "MODEL_DATA is written for Stokes I only"),
+        ("report", False, "reports are made for Stokes I only")))
 
 
 def _check_method(parameters):
@@ -329,15 +319,22 @@ def _check_method(parameters):
                          "significance above 0")
     if method == "tsara":
         return
-    for name, right, reason in (("regscale", 1.0, "its prior has no weight that depends on the noise"),
-                                ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
-                                ("gainfit", False, "it leaves the model free everywhere"),
-                                ("ndraws", 0, "its errors are not known from draws"),
-                                ("jackknife", False, "its errors are not known from draws"),
-                                ("parallel", False, "it runs in one process")):
-        if parameters[name] != right:
-            raise ValueError(f"{name} = {parameters[name]!r} with method = '{method}': {reason}; should be {right!r}, "
-                             "or method = 'tsara'")
+    _refuse(parameters, f"method = '{method}'", (
+        ("regscale", 1.0, "its prior has no weight that depends on the noise"),
+        ("significance", SolverOptions.significance, "it leaves the model free everywhere"),
+        ("gainfit", False, "it leaves the model free everywhere"),
+        ("ndraws", 0, "its errors are not known from draws"),
+        ("jackknife", False, "its errors are not known from draws"),
+        ("parallel", False, "it runs in one process")), ", or method = 'tsara'")
+
+
+def _refuse(parameters, asked, rules, otherwise=""):
+    """Raise on the first parameter that does not go with what was asked; rules are its name, what is right, and why."""
+    for name, right, reason in rules:
+        allowed = right if isinstance(right, tuple) else (right,)
+        if parameters[name] not in allowed:
+            raise ValueError(f"{name} = {parameters[name]!r} with {asked}: {reason}; should be "
+                             f"{' or '.join(map(repr, allowed))}{otherwise}")
 
 
 def _blocks(parameters):
