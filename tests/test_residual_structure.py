@@ -67,7 +67,6 @@ def test_it_does_not_go_on_for_ever(monkeypatch):
 
 @pytest.mark.parametrize("averaging", [True, False])
 def test_a_last_problem_that_went_on_is_continued_to_the_same_image(averaging, monkeypatch, tmp_path):
-    """Averages were made anew when it went on."""
     monkeypatch.setattr(reweighting, "LONGEST", 8)
     monkeypatch.setattr(reweighting, "structure_of", lambda ppd, bounds: 1e3 * 0.99**ppd.iteration)
     samples, options = observed(integrations=40), SolverOptions(nthreads=1, averaging=averaging)

@@ -271,7 +271,8 @@ def _begin_next(ppd, bounds, schedule, stage):
 def _begin_last(ppd, bounds, stage):
     """The last problem, with the weights as they are."""
     if ppd.averaged is not None and ppd.averaged.costly:
-        _renew_averages(ppd, stage)
+        stage.previous[...] = ppd.model
+        ppd.renew_averages(stage.previous)
     bounds.finish(ppd)
     stage.last, stage.start, stage.settled = True, ppd.iteration, 0
 
@@ -283,16 +284,8 @@ def _structure_falls(ppd, bounds, schedule, stage):
     before, stage.structure = stage.structure, structure_of(ppd, bounds)
     if not STRUCTURE < stage.structure < FALLING * before:
         return False
-    if ppd.averaged is not None and not ppd.averaged.costly:
-        _renew_averages(ppd, stage)
     stage.until, stage.settled = ppd.iteration + schedule.interval, 0
     return True
-
-
-def _renew_averages(ppd, stage):
-    """Make the averages exact for the present model, which a solution that is continued makes them for, too."""
-    stage.previous[...] = ppd.model
-    ppd.renew_averages(stage.previous)
 
 
 def _run_algorithm_1(ppd, bounds, schedule, stage, progress, stopped, keep):
