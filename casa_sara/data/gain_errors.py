@@ -19,7 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from casa_sara.data.visibilities import RowTable, Visibilities
+from casa_sara.data.visibilities import Visibilities
+from casa_sara.parallel.numbering import numbered
 from casa_sara.parallel.serial import SERIAL, Serial
 
 __all__ = ["AntennaGains", "GainErrors"]
@@ -84,14 +85,14 @@ class AntennaGains:
     def __init__(self, data: Visibilities, comm: Serial = SERIAL) -> None:
         self._row, self._comm, rows = data.row, comm, data.rows
         count = rows.time.size
-        ends = [_numbered([np.concatenate(2 * [rows.ms]), np.concatenate([rows.antenna1, rows.antenna2])], comm)]
-        self._first, self._second = ends[0][0][:count], ends[0][0][count:]
-        self._antennas = ends[0][1]
+        antennas, number = numbered(_columns(np.tile(rows.ms, 2), np.concatenate([rows.antenna1, rows.antenna2])), comm)
+        self._first, self._second, self._antennas = number[:count], number[count:], len(antennas)
         self._intervals = {}
         for name, more in (("scan", []), ("integration", [np.round(10 * rows.time).astype(np.int64)])):
-            interval, number = _numbered([*_constant(rows), *more], comm)
-            if name == "scan" or number * self._antennas**2 <= MOST_PAIRS:
-                self._intervals[name] = interval, number
+            intervals, interval = numbered(_columns(rows.ms, rows.observation, rows.field, rows.spw, rows.scan, *more),
+                                           comm)
+            if name == "scan" or len(intervals) * self._antennas**2 <= MOST_PAIRS:
+                self._intervals[name] = interval, len(intervals)
 
     def fit(self, predicted: np.ndarray, residual: np.ndarray) -> GainErrors:
         """Return the gain errors that explain a residual, for whichever interval explains more with its parameters.
@@ -200,14 +201,6 @@ def _solved(diagonal, weights, b, ridges):
     return real + 1j * imag
 
 
-def _constant(rows: RowTable) -> list[np.ndarray]:
-    """What gains never share."""
-    return [rows.ms, rows.observation, rows.field, rows.spw, rows.scan]
-
-
-def _numbered(columns, comm):
-    """Number the distinct combinations of the columns on all ranks; return that of each row, and how many there are."""
-    own = np.stack([np.asarray(column, np.int64) for column in columns], axis=1)
-    distinct = np.unique(np.concatenate(comm.allgather(np.unique(own, axis=0))), axis=0)
-    number = np.unique(np.concatenate([distinct, own]), axis=0, return_inverse=True)[1].ravel()[len(distinct):]
-    return number.astype(np.int32), len(distinct)
+def _columns(*columns):
+    """Return columns side by side, int64 (R, columns)."""
+    return np.stack([np.asarray(column, np.int64) for column in columns], axis=1)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from casa_sara.operators._workers import Workers
+from casa_sara.parallel.numbering import numbered
 from casa_sara.parallel.serial import SERIAL, Serial
 from casa_sara.runtime import jit
 
@@ -266,9 +267,7 @@ def mosaic_density(uvw: np.ndarray, beam_of_sample: np.ndarray, weight: np.ndarr
     row, column = (np.where(other, -cell, cell) for cell in cells)
     column += comm.largest(-int(column.min(initial=0)))
     place = row * (comm.largest(int(column.max(initial=0))) + 1) + column
-    here, place = np.unique(place, return_inverse=True)
-    everywhere = np.unique(np.concatenate(comm.allgather(here)))
-    place = np.searchsorted(everywhere, here)[place.ravel()]
+    everywhere, place = numbered(place, comm)
     density = np.zeros(uvw.shape[1])
     order = np.argsort(beam_of_sample, kind="stable")
     ends = np.cumsum(np.bincount(beam_of_sample, minlength=count))

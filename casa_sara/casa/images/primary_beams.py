@@ -19,6 +19,7 @@ from casa_sara.casa.ms.frames import SPEED_OF_LIGHT, is_of_earth, rotation_betwe
 from casa_sara.casa.ms.subtables import readable, texts
 from casa_sara.casa.runtime.tools import opened
 from casa_sara.options import Selection
+from casa_sara.parallel.numbering import numbered
 from casa_sara.parallel.serial import SERIAL
 
 __all__ = ["PrimaryBeams", "Profiles", "primary_beams"]
@@ -119,19 +120,12 @@ def primary_beams(data, selection, grid, profiles=None, comm=SERIAL):
     sizes = len(centres), len(dishes), len(dishes), len(profiles.bands_hz)
     of_row = np.ravel_multi_index((pointing_of_row, larger, smaller), sizes[:3])
     number = of_row[data.row] * sizes[3] + _nearest_band(data.freq_hz, profiles.bands_hz)
-    used, beam_of_sample = _common(number, comm)
+    used, beam_of_sample = numbered(number, comm)
     beams = np.array(np.unravel_index(used, sizes))
     wanted = [(dishes[k][0], dishes[k][1], dishes[n][1], int(number)) for _, k, n, number in beams.T.tolist()]
     profiles = comm.once(_with_kinds, profiles, sorted(set(wanted)), data, selection, grid)
     beams = np.stack([beams[0], [profiles.kinds.index(kind) for kind in wanted]], axis=1)
     return PrimaryBeams(centres, profiles, beams, beam_of_sample.astype(np.int32))
-
-
-def _common(values, comm):
-    """Return the distinct values (n,) of all ranks, sorted, and the place among them of each of this rank's."""
-    here, place = np.unique(values, return_inverse=True)
-    everywhere = np.unique(np.concatenate(comm.allgather(here)))
-    return everywhere, np.searchsorted(everywhere, here)[place.ravel()]
 
 
 def _nearest_band(freq_hz, bands_hz):
@@ -153,7 +147,7 @@ def _pointings(data, grid, comm):
     """Return the pixels (P, 2) of the distinct directions of fields, and the number of that of each row, int (R,)."""
     rows, centre = data.rows, data.phase_center
     most = 1 + max(field for _, field in data.fields)
-    fields, of_row = _common(rows.ms.astype(np.int64) * most + rows.field, comm)
+    fields, of_row = numbered(rows.ms.astype(np.int64) * most + rows.field, comm)
     cosines = []
     for number in fields.tolist():
         matrix = rotation_between(data.fields[divmod(number, most)], centre)
@@ -214,7 +208,7 @@ def _check_dishes(kinds):
 
 def _bands(freq_hz, weight, comm):
     """Return the mean frequencies of groups of similar ones, float64 (F,)."""
-    distinct, of_sample = _common(np.asarray(freq_hz, float), comm)
+    distinct, of_sample = numbered(np.asarray(freq_hz, float), comm)
     group, start = np.zeros(distinct.size, int), distinct[0]
     for k in range(1, distinct.size):
         new = distinct[k] > start * (1 + BAND)
