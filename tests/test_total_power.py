@@ -68,7 +68,7 @@ def test_a_call_allocates_nothing():
     both()
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert peak < 70_000
+    assert peak < vis.nbytes / 2  # NumPy's buffers take 65 kB of it
 
 
 @pytest.mark.parametrize("dtype, accuracy", [(np.float64, 1e-6), (np.float32, 2e-6)])
