@@ -43,7 +43,7 @@ def timed(name, label, module=continuum):
             parts[label] = parts.get(label, 0.0) + time.perf_counter() - begin
     setattr(module, name, replacement)
 
-for name, label in (("forecast_run", "look at the data, forecast"), ("_read", "read, primary beam"),
+for name, label in (("forecast_run", "look at the data, forecast"), ("read_data", "read, primary beam"),
                     ("point_spread", "weights, PSF, beam; twice"), ("solve_image", "solve"),
                     ("write_products", "write")):
     timed(name, label)

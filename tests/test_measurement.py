@@ -224,6 +224,15 @@ def test_decimation_factor_and_aliases(reach, factor, eps):
     assert all(np.all(spectrum(k / factor) <= 1.01 * eps * spectrum(0)) for k in range(1, factor))
 
 
+@pytest.mark.parametrize("width, eps", [(4, 1e-3), (5, 3e-5), (8, 1e-6), (16, 1e-13)])
+def test_padding_is_the_least_that_is_accurate(width, eps):
+    sigma = kaiser_bessel.padding(width, eps)
+    assert 1.1 < sigma < 4
+    assert kaiser_bessel.alias_level(width, sigma) <= eps < kaiser_bessel.alias_level(width, sigma - 1e-3)
+    assert kaiser_bessel.padding(width, eps, low=3.9) == 3.9
+    assert kaiser_bessel.padding(width, eps, high=sigma - 1e-3) == np.inf
+
+
 @pytest.mark.parametrize("width, sigma", [(4, 2.0), (7, 1.5), (12, 1.3)])
 def test_kernel_transform_and_polynomials(width, sigma):
     beta = kaiser_bessel.kernel_shape(width, sigma)

@@ -15,8 +15,8 @@ import pytest
 
 from casa_sara import tsara
 from casa_sara.options import SolverOptions
-from casa_sara.private.parameters import TSARA
-from casa_sara.private.validation import Parameter, validate
+from casa_sara.private.parameters import SARACOMPARE, TSARA
+from casa_sara.private.validation import Parameter, checked, validate
 
 BY_NAME = {parameter.name: parameter for parameter in TSARA}
 GOOD = {"vis": "data.ms", "imagename": "try", "cell": "0.1arcsec"}
@@ -235,6 +235,18 @@ def test_defaults_reach_the_implementation(received):
     defaults = {name: parameter.default for name, parameter in inspect.signature(tsara).parameters.items()}
     assert received == [defaults | GOOD]
     assert received[0]["wavelets"] is not defaults["wavelets"]  # a copy: the default cannot be changed
+
+
+@pytest.mark.parametrize("parameter", [p for p in (*TSARA, *SARACOMPARE) if not p.required], ids=lambda p: p.name)
+def test_default_is_what_the_validator_makes_of_it(parameter):
+    """So that `validate` may leave it alone."""
+    assert repr(checked(parameter, parameter.default)) == repr(parameter.default)
+
+
+def test_default_of_another_type_is_coerced():
+    parameters = Parameter("scale", ("double",), 1.0, ""), Parameter("scales", ("doubleVec",), [1.0], "")
+    found = validate(parameters, {"scale": 1, "scales": [1]})
+    assert repr(found) == "{'scale': 1.0, 'scales': [1.0]}"
 
 
 def test_python_and_numpy_values_are_taken(received):
