@@ -21,6 +21,12 @@ def _session_folder(tmp_path_factory):
     os.chdir(tmp_path_factory.mktemp("session"))
 
 
+@pytest.fixture
+def every_thread(monkeypatch):
+    """Use all threads, however little there is to do."""
+    monkeypatch.setattr("casa_sara.operators._workers.LEAST_NS", 1e-9)
+
+
 @pytest.fixture(autouse=True)
 def _test_folder(tmp_path, monkeypatch):
     """Run every test in a folder of its own."""

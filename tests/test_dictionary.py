@@ -16,6 +16,8 @@ from casa_sara.operators import _filter_bank, _vectors, _wavelet_kernels, _wavel
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.options import SARA_BASES
 
+pytestmark = pytest.mark.usefixtures("every_thread")
+
 SHAPES = [(1, 1), (2, 40), (7, 3), (33, 18), (64, 128), (50, 200), (129, 66)]
 make = cache(SaraDictionary)
 

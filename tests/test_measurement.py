@@ -12,6 +12,8 @@ from casa_sara.operators import kaiser_bessel
 from casa_sara.operators.decimation import AxisDecimation
 from casa_sara.operators.measurement import MeasurementOperator, choose_eps
 
+pytestmark = pytest.mark.usefixtures("every_thread")
+
 CELL = np.array([1.1e-6, 0.9e-6])
 SINGLE = [(np.float32, eps) for eps in (1e-3, 1e-4, 1e-5, 1e-6)]
 DOUBLE = [(np.float64, eps) for eps in (1e-8, 1e-12)]

@@ -15,6 +15,8 @@ from casa_sara.operators.mosaic import MosaicOperator, remaining_w_phase
 from casa_sara.operators.sky import sky_operator
 from casa_sara.options import ImageGrid, Selection, Spectrum
 
+pytestmark = pytest.mark.usefixtures("every_thread")
+
 SHAPE, CELL = (90, 74), (1e-5, 1.3e-5)
 SQUARES = np.linspace(0, 1, 4097)
 HEXAGON = [(0, 0), (30, 0), (-15, 26), (-15, -26), (15, 26), (15, -26), (-30, 0)]  # arcsec, half a beam apart

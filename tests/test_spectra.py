@@ -32,6 +32,8 @@ from casa_sara.solver.point_sources import PointSources
 from casa_sara.solver.positivity import Release
 from casa_sara.solver.significance import point_response
 
+pytestmark = pytest.mark.usefixtures("every_thread")
+
 __all__ = ["vis"]  # a fixture
 
 

@@ -16,6 +16,8 @@ from casa_sara.comparison.compare_images import compare_images
 from casa_sara.operators.sky import further_bytes, sky_operator
 from casa_sara.options import Comparing, ImageGrid, Selection, Spectrum
 
+pytestmark = pytest.mark.usefixtures("every_thread")
+
 SHAPE, CELL, SIZE = (30, 41), (2e-3, 1.7e-3), 400
 # VLA D, 4 to 8 GHz in four windows; two sources, -0.8 both
 WINDOWS = tuple((f"{freq}GHz", "2MHz", 2) for freq in (4.0, 5.2, 6.6, 8.0))

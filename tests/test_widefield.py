@@ -22,6 +22,8 @@ from casa_sara.operators.sky import further_bytes
 from casa_sara.operators.widefield import MOST_TERMS, WGridder, WTerm, w_operator
 from casa_sara.options import Comparing, ImageGrid, Selection
 
+pytestmark = pytest.mark.usefixtures("every_thread")
+
 CELL = np.array([2.2e-3, 1.8e-3])
 SHAPE = (33, 48)
 # VLA D at 74 MHz, a field of 10 degrees; the second source is 3.5 degrees from the centre, and w turns it by 3 rad

@@ -35,6 +35,7 @@ from casa_sara.options import SARA_BASES
 __all__ = ["Band", "SaraDictionary", "coefficient_bytes", "filter_lengths"]
 
 ORIENTATIONS = ("aa", "ad", "da", "dd")
+TRANSFORM_NS = 0.5  # of a coefficient, a step of the transform on one thread
 
 
 class Band(NamedTuple):
@@ -112,7 +113,7 @@ class SaraDictionary:
         self.coef_shape = (len(self.wavelets), *padded)
         self.n_coefs = len(self.wavelets) * padded[0] * padded[1]
         self._filters = filters(self.wavelets, self.n_bases, self.dtype)
-        self._workers = Workers(nthreads)
+        self._workers = Workers(Workers(nthreads).for_work(TRANSFORM_NS * self.n_coefs))
         self._work = self._workspaces()
         self._params = np.zeros((len(self.wavelets), 2), self.dtype)
         self._ring = np.zeros((self._workers.count, RING_ROWS, padded[1]), self.dtype)

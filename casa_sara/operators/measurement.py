@@ -33,6 +33,7 @@ __all__ = ["SMALLEST_EPS", "MeasurementOperator", "Summed", "WorkSpace", "check_
 
 ARCSEC_PER_RAD = 180.0 * 3600.0 / np.pi
 LARGEST_EPS = 1e-4
+DECIMATE_NS, EXPAND_NS, ROWS_NS = 2.0, 1.5, 1.0  # of a pixel on one thread
 SMALLEST_EPS = {np.dtype(np.float32): 1e-6, np.dtype(np.float64): 1e-13}
 
 
@@ -134,7 +135,8 @@ class MeasurementOperator:
         """
         image, out = for_forward(self, image, out)
         self._nufft.clear()
-        self.workers.run(decimate, image, self._rows, self._columns, self._nufft.grid, self._lines, self._scratch)
+        self.workers.run(decimate, image, self._rows, self._columns, self._nufft.grid, self._lines, self._scratch,
+                         work_ns=DECIMATE_NS * image.size)
         self._nufft.to_points(out)
         return out
 
@@ -169,8 +171,9 @@ class MeasurementOperator:
         """
         vis, out = for_adjoint(self, vis, out)
         self._nufft.from_points(vis)
-        self.workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch)
-        self.workers.run(expand_rows, self._lines, self._rows, out)
+        self.workers.run(expand, self._nufft.grid, self._rows, self._columns, self._lines, self._scratch,
+                         work_ns=EXPAND_NS * out.size)
+        self.workers.run(expand_rows, self._lines, self._rows, out, work_ns=ROWS_NS * out.size)
         return out
 
 

@@ -21,6 +21,7 @@ RELAXATION = 1.8
 # ζ = 1/‖Ψ‖² the bracket is 2, or less where a norm is known from above only. The paper gives no number; this is 1 %
 # below the limit.
 STEP = 0.495
+SAMPLE_NS, PIXEL_NS = 2.5, 1.8  # on one thread, of a data and of an image step
 PIECE = 4096  # samples of a block that one thread works on: sums are the same for any number of threads
 STATE_ARRAYS = ("model", "anchor", "model_bar", "lowest", "l1_dual", "l1_weights", "l2_dual", "_phi_anchor",
                 "multipliers", "residual_norms")
@@ -312,7 +313,8 @@ class AdaptivePPD:
         pairs = [vis.view(self.precond.dtype).reshape(-1, 2)
                  for vis in (self.l2_dual, self._phi_bar, self._phi_anchor, self.vis)]
         self.measurement.workers.run(kernels.data_step, *pairs, self.precond, self._pieces, self.multipliers,
-                                     self.precond.dtype.type(self.relaxation), self._piece_norms_sq)
+                                     self.precond.dtype.type(self.relaxation), self._piece_norms_sq,
+                                     work_ns=SAMPLE_NS * self.vis.size)
         self._norms_sq[:] = np.bincount(self._pieces[:, 2], self._piece_norms_sq, self.n_blocks)
         summed_norms_sq = self.comm.iallreduce(self._norms_sq)
         self.measurement.adjoint(self.l2_dual, self._data_gradient)
@@ -338,7 +340,8 @@ class AdaptivePPD:
         real = self.model.dtype.type
         gradients, steps = self._summed_gradients((real(self.tau), real(self.l2_step), real(self.relaxation)))
         self.measurement.workers.run(kernels.primal_step, self.model, self.anchor, self.model_bar, *gradients, steps,
-                                     self.lowest, self._sums, part=self.comm.part)
+                                     self.lowest, self._sums, part=self.comm.part,
+                                     work_ns=PIXEL_NS * self.model.size)
         self.comm.barrier()
         of_parts = np.array([self._sums[part, :3].sum(axis=0) for part in self.planes.parts])
         greatest = self._sums[:, 3].max()

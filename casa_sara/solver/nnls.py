@@ -15,6 +15,7 @@ __all__ = ["NNLS_ITERATIONS", "NNLSFit", "nnls"]
 FIRST_PENALTY = 0.5  # of the brightest pixel of the first gradient step
 NNLS_ITERATIONS = 80
 FEWEST_ITERATIONS = 10  # even if there is no time
+STEP_NS, EXTRAPOLATE_NS = 2.0, 1.0  # of a pixel on one thread
 PATH = 0.75  # of the iterations, over which the penalty falls
 
 
@@ -93,12 +94,14 @@ def nnls(measurement: Measurement, vis: np.ndarray, precond: np.ndarray, data_no
         if first is None:
             first = FIRST_PENALTY * float(step) * float(max(gradient.max(), -gradient.min()))
         penalty = first * fit.last_penalty ** min(iteration / (PATH * fit.max_iter), 1.0) if fit.last_penalty else 0
-        run(kernels.nnls_step, model, momentum, gradient, step, dtype.type(penalty), fit.positivity, uphill)
+        run(kernels.nnls_step, model, momentum, gradient, step, dtype.type(penalty), fit.positivity, uphill,
+            work_ns=STEP_NS * model.size)
         # momentum that points uphill is dropped
         t = 1.0 if uphill.sum() > 0 else t
         t_next = 0.5 * (1 + np.sqrt(1 + 4 * t * t))
         settled = fit.reltol > 0 and np.linalg.norm(gradient - model) < fit.reltol * np.linalg.norm(gradient)
-        run(kernels.extrapolate, model, momentum, gradient, dtype.type((t - 1) / t_next))
+        run(kernels.extrapolate, model, momentum, gradient, dtype.type((t - 1) / t_next),
+            work_ns=EXTRAPOLATE_NS * model.size)
         t = t_next
         if settled or stopped() and iteration + 1 >= FEWEST_ITERATIONS:
             break
