@@ -1,6 +1,7 @@
 """Time and memory of one whole iteration of adaptive PPD, beside the same algorithm on PyWavelets and finufft.
 
     python benchmarks/iteration.py [--cases 0 1 2 …] [--repeat 15] [--pfb]
+    python benchmarks/iteration.py --stages [--repeat 15]   # every stage with one thread and with two
 
 The iteration is that of the task: single precision, Dirac and Db1–Db8 on four levels, weights, over-relaxation, all
 blocks through one operator. "PyWavelets + finufft" is the same algorithm (the same class, in double precision) on
@@ -9,6 +10,9 @@ Medians (quartiles); both take turns. The floor: bytes that have to be moved (im
 coefficients and weights, grid) over the copy bandwidth measured in the same run, or the multiplications and additions
 of the wavelet filters over the peak rate, whichever is more. With --pfb the analysis and synthesis of pfb-imaging's
 dictionary (from PyPI) are timed too, in double precision as it has them.
+
+With --stages the kernels and FFTs of an iteration are timed one by one, with one thread and with two in turns; the rest
+is Python. "wake" is the time of a call of all threads with nothing to do: an iteration has about 13 of them.
 
 Memory is that of a process with casatools loaded, above what it takes before, at its peak through operators and
 iterations; growth is what is added from the 10th iteration to the last.
@@ -20,7 +24,11 @@ import argparse
 import gc
 import subprocess
 import sys
+import time
+from collections import defaultdict
+from contextlib import ExitStack
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 
@@ -35,10 +43,12 @@ from measurement_operator import Finufft, vla_uv
 from casa_sara.operators._workers import Workers
 from casa_sara.operators.dictionary import SaraDictionary
 from casa_sara.operators.measurement import MeasurementOperator
+from casa_sara.runtime.jit import kernel
 from casa_sara.solver.adaptive_ppd import RELAXATION, AdaptivePPD
 
 CASES = [(512, 256, 100_000, 12, 1), (512, 256, 100_000, 12, 2), (1024, 1024, 100_000, 12, 1),
          (1024, 1024, 1_000_000, 12, 1), (2048, 2048, 1_000_000, 12, 2), (4096, 2048, 2_000_000, 22, 2)]
+STAGED = [(256, 256, 20_000, 12, 2), (1024, 1024, 100_000, 12, 2), (1024, 1024, 1_000_000, 12, 2)]
 THRESHOLD = 1e-3
 
 
@@ -135,6 +145,65 @@ def time_case(case, repeat, slow_repeat):
               flush=True)
 
 
+class Stages:
+    """Seconds of each kernel and FFT of a step."""
+
+    def __init__(self):
+        self.seconds = defaultdict(float)
+
+    def of(self, function):
+        """The function, timed under the name of its second argument, a kernel."""
+        def timed(*arguments, **options):
+            begin = time.perf_counter()
+            try:
+                return function(*arguments, **options)
+            finally:
+                self.seconds[arguments[1].__name__] += time.perf_counter() - begin
+        return timed
+
+    def step(self, ppd):
+        """Do one step; return the seconds of its stages and of all of it."""
+        self.seconds.clear()
+        with ExitStack() as replaced:
+            replaced.enter_context(mock.patch.object(Workers, "run", self.of(Workers.run)))
+            begin = time.perf_counter()
+            ppd.step()
+            whole = time.perf_counter() - begin
+        return self.seconds | {"the rest": whole - sum(self.seconds.values()), "all": whole}
+
+
+def time_stages(case, repeat):
+    """Print how long every stage of an iteration takes with one thread and with two."""
+    ppds, stages = [ours((*case[:4], threads)) for threads in (1, 2)], Stages()
+    times = [[], []]
+    for turn in range(repeat + 3):
+        for ppd, found in zip(ppds, times):
+            one = stages.step(ppd)
+            if turn >= 3:
+                found.append(one)
+    nx, ny, size, blocks, _ = case
+    print(f"\n{nx}×{ny}, {ppds[0].vis.size:.3g} in {blocks}:\n\n| stage | 1 thread, ms | 2 threads, ms | ratio |\n"
+          + "|---" * 4 + "|")
+    middle = [{name: 1e3 * np.median([one[name] for one in found]) for name in found[0]} for found in times]
+    for name in sorted(middle[0], key=middle[0].get, reverse=True):
+        one, two = middle[0][name], middle[1][name]
+        print(f"| {name.strip('_')} | {one:.2f} | {two:.2f} | {one / two:.2f} |", flush=True)
+
+
+def time_waking(repeat):
+    """Print how long it takes to call threads that have nothing to do."""
+    print("\n| threads | wake, µs |\n|---|---|")
+    for threads in (1, 2, 4, 8, 16):
+        run = Workers(threads).run
+        found = [seconds(lambda: [run(nothing) for _ in range(50)]) / 50 for _ in range(repeat)]
+        print(f"| {threads} | {1e6 * np.median(found):.0f} |", flush=True)
+
+
+@kernel()
+def nothing(worker, workers):
+    """A kernel without work."""
+
+
 def measure_memory(case, iterations):
     """Print what operators and iterations take, above a process with casatools."""
     import casatools
@@ -198,12 +267,19 @@ def main():
     parser.add_argument("--slow-repeat", type=int, default=3, help="repetitions of PyWavelets and finufft")
     parser.add_argument("--pfb", action="store_true",
                         help="time pfb-imaging's dictionary too, which has to be installed")
+    parser.add_argument("--stages", action="store_true", help="only time the stages of some sizes")
     parser.add_argument("--memory", type=int, metavar="CASE",
                         help="only measure the memory of this case, in this process")
     parser.add_argument("--iterations", type=int, default=1000, help="for the growth of the memory")
     options = parser.parse_args()
     if options.memory is not None:
         measure_memory(CASES[options.memory], options.iterations)
+        return
+    if options.stages:
+        print(machine())
+        for case in STAGED:
+            time_stages(case, options.repeat)
+        time_waking(options.repeat)
         return
     cases = [CASES[number] for number in options.cases]
     print(f"{machine()}; PyWavelets {pywt.__version__}, finufft {finufft.__version__}\n")
