@@ -12,7 +12,7 @@ of the wavelet filters over the peak rate, whichever is more. With --pfb the ana
 dictionary (from PyPI) are timed too, in double precision as it has them.
 
 With --stages the kernels and FFTs of an iteration are timed one by one, with one thread and with two in turns; the rest
-is Python. "wake" is the time of a call of all threads with nothing to do: an iteration has about 13 of them.
+is Python. "wake" is the time of a call of all threads with nothing to do: an iteration has 19 of them.
 
 Memory is that of a process with casatools loaded, above what it takes before, at its peak through operators and
 iterations; growth is what is added from the 10th iteration to the last.
