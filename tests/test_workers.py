@@ -1,6 +1,8 @@
 """Threads of the compiled kernels: how many take part."""
 
 import threading
+import time
+import weakref
 
 import pytest
 
@@ -34,6 +36,66 @@ def test_others_are_waited_for():
 
     Workers(3).run(kernel)
     assert sorted(done) == [0, 1, 2]
+
+
+def test_an_error_of_any_share_is_raised_when_all_are_done():
+    done = []
+
+    def kernel(worker, count):
+        if worker == failing:
+            raise ArithmeticError(f"share {worker}")
+        done.append(worker)
+
+    workers = Workers(3)
+    for failing in range(3):
+        done.clear()
+        with pytest.raises(ArithmeticError, match=f"share {failing}"):
+            workers.run(kernel)
+        assert sorted(done) == [worker for worker in range(3) if worker != failing]
+    failing = None
+    workers.run(kernel)  # and the threads are still there
+
+
+def test_calls_at_once_do_not_take_each_others_ends():
+    """Two threads that share one object: each waits for its own call."""
+    workers, errors = Workers(3), []
+
+    def call(me):
+        for turn in range(300):
+            seen = []
+            workers.run(lambda worker, count, seen=seen: seen.append(worker))
+            if sorted(seen) != [0, 1, 2]:
+                errors.append((me, turn, seen))
+
+    callers = [threading.Thread(target=call, args=(me,)) for me in range(2)]
+    for caller in callers:
+        caller.start()
+    for caller in callers:
+        caller.join()
+    assert not errors
+
+
+def test_threads_end_with_their_object_and_hold_no_arguments():
+    before = set(threading.enumerate())
+    workers, barrier = Workers(3), threading.Barrier(3, timeout=10)
+
+    class Image:
+        pass
+
+    image = Image()
+    kept = weakref.ref(image)
+    workers.run(lambda image, worker, count: barrier.wait(), image)
+    del image
+    ours = set(threading.enumerate()) - before
+    assert len(ours) == 2
+    deadline = time.monotonic() + 10
+    while kept() is not None and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert kept() is None
+    del workers
+    for thread in ours:
+        thread.join(10)
+        assert not thread.is_alive()
 
 
 @pytest.mark.parametrize("count", [0, -1])

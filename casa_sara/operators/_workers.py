@@ -1,18 +1,21 @@
 """Threads for compiled kernels that release Python's lock.
 
-Threads of a pool sleep while there is nothing to do; those of an OpenMP runtime spin, and
-would take the processor from the next stage.
+Threads that have nothing to do sleep; those of an OpenMP runtime spin, and would take the processor from the next
+stage.  A thread takes some 40 µs to wake, and the thread that calls does what no other has begun by then.
 """
 
 from __future__ import annotations
 
 import math
+import threading
+import weakref
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from queue import Empty, SimpleQueue
+from typing import Any
 
 __all__ = ["Workers"]
 
-LEAST_NS = 5e4  # work that is worth a thread: to wake it and to wait for it takes about as long
+LEAST_NS = 5e4  # work that is worth a thread
 
 
 class Workers:
@@ -22,7 +25,10 @@ class Workers:
         self.count = int(count)
         if self.count < 1:
             raise ValueError(f"nthreads={count} must be at least 1")
-        self._pool = ThreadPoolExecutor(self.count - 1) if self.count > 1 else None
+        self._shares: SimpleQueue[Any] = SimpleQueue()
+        for _ in range(1, self.count):
+            threading.Thread(target=_work, args=(self._shares,), name="casa_sara worker", daemon=True).start()
+        weakref.finalize(self, _dismiss, self._shares, self.count - 1)
 
     def for_work(self, work_ns: float) -> int:
         """Return how many threads are worth while for what takes one of them `work_ns` nanoseconds."""
@@ -37,8 +43,41 @@ class Workers:
         """
         here = self.for_work(work_ns / part[1])
         first, count = part[0] * here, part[1] * here
-        others = [self._pool.submit(kernel, *args, first + worker, count)
-                  for worker in range(1, here)] if self._pool else []
-        kernel(*args, first, count)
-        for other in others:
-            other.result()
+        if here == 1:
+            kernel(*args, first, count)
+            return
+        done: SimpleQueue[BaseException | None] = SimpleQueue()
+        for worker in range(first + 1, first + here):
+            self._shares.put((kernel, args, worker, count, done))
+        _do(kernel, args, first, count, done)
+        try:
+            while True:
+                _do(*self._shares.get_nowait())
+        except Empty:
+            pass
+        errors = [error for error in [done.get() for _ in range(here)] if error is not None]
+        if errors:
+            raise errors[0]
+
+
+def _do(kernel, args, worker, count, done):
+    """Do a share of a call, and tell the caller."""
+    try:
+        kernel(*args, worker, count)
+    except BaseException as error:
+        done.put(error)
+    else:
+        done.put(None)
+
+
+def _work(shares):
+    """Do what there is to do, until there is None."""
+    while (share := shares.get()) is not None:
+        _do(*share)
+        del share  # an image that nobody else holds must not live until the next call
+
+
+def _dismiss(shares, count):
+    """Let the threads end."""
+    for _ in range(count):
+        shares.put(None)
