@@ -1,4 +1,4 @@
-"""The last problem goes on while the residual holds structure that becomes less."""
+"""The last problem goes on while the residual holds structure that changes."""
 
 from dataclasses import replace
 
@@ -33,7 +33,8 @@ def observed(integrations=4, noise=0.03):
     ([20.0, 19.6], 1),  # structure that the data leave
     ([20.0, 15.0, 10.0, 9.9], 3),
     ([20.0, 15.0, 4.0], 2),
-    ([8.0, 9.0], 1),
+    ([8.0, 9.0, 9.1], 2),  # more before it is less
+    ([20.0, 25.0, 15.0, 4.0], 3),
 ])
 def test_it_goes_on_an_interval_at_a_time(structures, intervals, monkeypatch):
     samples, options = observed(), SolverOptions(nthreads=1)

@@ -38,7 +38,7 @@ NEARLY = 2.0  # bounds may be off by so many of their tolerances where the model
 LONGEST = 50  # intervals of the last problem: what still moves then is below what the data can tell
 USUAL = 9  # re-weightings that most data need
 OF_COSTLY = (0, 1, 2, 4, 8, 16)  # re-weightings at which averages of visibilities on the disk are made anew
-FALLING = 0.97  # of the residual's structure an interval before: what falls so much is not left by the data
+CHANGING = 0.03  # of the structure that the residual holds, in an interval: then the last problem goes on
 PATIENCE = 300  # iterations that a settled model is given to meet its bounds
 
 
@@ -107,7 +107,7 @@ class Stage:
     structure : float
         Largest S/N of the residual over a beam or more, when the last problem had converged.
     until : int
-        Iteration to which the last problem goes on, because that becomes less.
+        Iteration to which the last problem goes on, because that still changes.
     release : Release
     support : SignificantSupport or None
     record : SolverRecord
@@ -260,7 +260,7 @@ def _begin(ppd, bounds, schedule):
 def _begin_next(ppd, bounds, schedule, stage):
     """The next problem, or the last one anew; return False where nothing would change."""
     if stage.last:
-        return schedule.confined and _structure_falls(ppd, bounds, schedule, stage)
+        return schedule.confined and _structure_changes(ppd, bounds, schedule, stage)
     if _renew_weights(ppd, bounds, schedule, stage):
         stage.start, stage.settled = ppd.iteration, 0
     else:
@@ -277,12 +277,12 @@ def _begin_last(ppd, bounds, stage):
     stage.last, stage.start, stage.settled = True, ppd.iteration, 0
 
 
-def _structure_falls(ppd, bounds, schedule, stage):
-    """Whether the residual still holds structure that becomes less: then the last problem goes on for an interval."""
+def _structure_changes(ppd, bounds, schedule, stage):
+    """Whether the residual still holds structure, and it changes: then the last problem goes on for an interval."""
     if ppd.iteration - stage.start >= LONGEST * schedule.interval:
         return False
     before, stage.structure = stage.structure, structure_of(ppd, bounds)
-    if not STRUCTURE < stage.structure < FALLING * before:
+    if stage.structure <= STRUCTURE or abs(stage.structure / before - 1) <= CHANGING:
         return False
     stage.until, stage.settled = ppd.iteration + schedule.interval, 0
     return True
