@@ -18,6 +18,12 @@ def test_a_thread_is_used_where_there_is_work_for_it(least, expected):
     assert seen == {(worker, expected) for worker in range(expected)}
 
 
+def test_no_more_threads_are_there_than_are_ever_worth_while():
+    before = set(threading.enumerate())
+    workers = Workers(8, 3.5 * _workers.LEAST_NS)
+    assert workers.count == 3 and len(set(threading.enumerate()) - before) == 2
+
+
 def test_processes_share_the_work():
     """With a third of the work in each of three processes, as many threads in all of them."""
     seen = set()

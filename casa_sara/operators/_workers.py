@@ -19,19 +19,34 @@ LEAST_NS = 5e4  # work that is worth a thread
 
 
 class Workers:
-    """A fixed number of threads that share the work of each call, or as many of them as it can keep busy."""
+    """A fixed number of threads that share the work of each call, or as many of them as it can keep busy.
 
-    def __init__(self, count: int) -> None:
+    Parameters
+    ----------
+    count : int
+        Most threads, that which calls among them.
+    work_ns : float
+        What a call takes one thread in nanoseconds, roughly, where that is so of every call: there are no more threads
+        than are worth while.
+
+    Attributes
+    ----------
+    count : int
+        Threads.
+    """
+
+    def __init__(self, count: int, work_ns: float = math.inf) -> None:
         self.count = int(count)
         if self.count < 1:
             raise ValueError(f"nthreads={count} must be at least 1")
+        self.count = self.for_work(work_ns)
         self._shares: SimpleQueue[Any] = SimpleQueue()
         for _ in range(1, self.count):
             threading.Thread(target=_work, args=(self._shares,), name="casa_sara worker", daemon=True).start()
         weakref.finalize(self, _dismiss, self._shares, self.count - 1)
 
     def for_work(self, work_ns: float) -> int:
-        """Return how many threads are worth while for what takes one of them `work_ns` nanoseconds."""
+        """Return how many of the threads are worth while for what takes one of them `work_ns` nanoseconds."""
         return 1 if work_ns < 2 * LEAST_NS else int(min(self.count, work_ns / LEAST_NS))
 
     def run(self, kernel: Callable[..., object], *args, part: tuple[int, int] = (0, 1),

@@ -113,7 +113,7 @@ class SaraDictionary:
         self.coef_shape = (len(self.wavelets), *padded)
         self.n_coefs = len(self.wavelets) * padded[0] * padded[1]
         self._filters = filters(self.wavelets, self.n_bases, self.dtype)
-        self._workers = Workers(Workers(nthreads).for_work(TRANSFORM_NS * self.n_coefs))
+        self._workers = Workers(nthreads, TRANSFORM_NS * self.n_coefs)
         self._work = self._workspaces()
         self._params = np.zeros((len(self.wavelets), 2), self.dtype)
         self._ring = np.zeros((self._workers.count, RING_ROWS, padded[1]), self.dtype)

@@ -15,8 +15,8 @@ __all__ = ["NNLS_ITERATIONS", "NNLSFit", "nnls"]
 FIRST_PENALTY = 0.5  # of the brightest pixel of the first gradient step
 NNLS_ITERATIONS = 80
 FEWEST_ITERATIONS = 10  # even if there is no time
-STEP_NS, EXTRAPOLATE_NS = 2.0, 1.0  # of a pixel on one thread
 PATH = 0.75  # of the iterations, over which the penalty falls
+STEP_NS, EXTRAPOLATE_NS = 2.0, 1.0  # of a pixel on one thread
 
 
 @dataclass(frozen=True)
