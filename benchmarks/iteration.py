@@ -26,7 +26,6 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from contextlib import ExitStack
 from pathlib import Path
 from unittest import mock
 
@@ -145,40 +144,26 @@ def time_case(case, repeat, slow_repeat):
               flush=True)
 
 
-class Stages:
-    """Seconds of each kernel and FFT of a step."""
+def time_calls(ppd):
+    """Do one step; return the seconds of each kernel and FFT, of the rest and of all."""
+    found, run = defaultdict(float), Workers.run
 
-    def __init__(self):
-        self.seconds = defaultdict(float)
+    def timed(workers, kernel, *arguments, **options):
+        begin = time.perf_counter()
+        run(workers, kernel, *arguments, **options)
+        found[kernel.__name__] += time.perf_counter() - begin
 
-    def of(self, function):
-        """The function, timed under the name of its second argument, a kernel."""
-        def timed(*arguments, **options):
-            begin = time.perf_counter()
-            try:
-                return function(*arguments, **options)
-            finally:
-                self.seconds[arguments[1].__name__] += time.perf_counter() - begin
-        return timed
-
-    def step(self, ppd):
-        """Do one step; return the seconds of its stages and of all of it."""
-        self.seconds.clear()
-        with ExitStack() as replaced:
-            replaced.enter_context(mock.patch.object(Workers, "run", self.of(Workers.run)))
-            begin = time.perf_counter()
-            ppd.step()
-            whole = time.perf_counter() - begin
-        return self.seconds | {"the rest": whole - sum(self.seconds.values()), "all": whole}
+    with mock.patch.object(Workers, "run", timed):
+        whole = seconds(ppd.step)
+    return found | {"the rest": whole - sum(found.values()), "all": whole}
 
 
 def time_stages(case, repeat):
     """Print how long every stage of an iteration takes with one thread and with two."""
-    ppds, stages = [ours((*case[:4], threads)) for threads in (1, 2)], Stages()
-    times = [[], []]
+    ppds, times = [ours((*case[:4], threads)) for threads in (1, 2)], ([], [])
     for turn in range(repeat + 3):
         for ppd, found in zip(ppds, times):
-            one = stages.step(ppd)
+            one = time_calls(ppd)
             if turn >= 3:
                 found.append(one)
     nx, ny, size, blocks, _ = case

@@ -47,7 +47,7 @@ class Workers:
 
     def for_work(self, work_ns: float) -> int:
         """Return how many of the threads are worth while for what takes one of them `work_ns` nanoseconds."""
-        return 1 if work_ns < 2 * LEAST_NS else int(min(self.count, work_ns / LEAST_NS))
+        return max(int(min(self.count, work_ns / LEAST_NS)), 1)
 
     def run(self, kernel: Callable[..., object], *args, part: tuple[int, int] = (0, 1),
             work_ns: float = math.inf) -> None:
